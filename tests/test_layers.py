@@ -61,6 +61,7 @@ IMPURE_PLACES: Final = (  # where clock, socket, process, file and chance may li
     "aftbed.cli",
     "aftbed.api",
     "aftbed.pytest_plugin",
+    "aftbed.core.archive",
     "aftbed.core.input_file",  # the readers of files in core: all upper rows read by them
     "aftbed.core.yaml_file",
 )

@@ -22,6 +22,7 @@ divides it among them.
 """
 
 import math
+import re
 from collections.abc import Sequence
 from random import Random
 from typing import Final
@@ -41,6 +42,7 @@ from aftbed.campaign.statistics import (
     tail,
 )
 from aftbed.core.errors import ConfigError
+from aftbed.judge.outcome import UNKNOWN
 
 BITS: Final = 32  # of chance for each draw; with at most PAIRS_MAX pairs no pair is favoured by over 0.1 %
 PAIRS_MAX: Final = 1 << 22
@@ -53,6 +55,11 @@ def mcnemar(only_base: int, only_new: int) -> float:
     assert only_base >= 0 and only_new >= 0
     differing = only_base + only_new
     return min(1.0, 2 * float(special.bdtr(min(only_base, only_new), differing, 0.5)))
+
+
+def resamples_least(confidence: float) -> int:
+    """How many resamples it takes until enough of them lie beyond each bound."""
+    return math.ceil(BEYOND_MIN / tail(confidence) - 1e-6)  # 100 at 0.9, whose tail is 0.0499...
 
 
 def paired_quantile_shift(
@@ -69,8 +76,7 @@ def paired_quantile_shift(
     """
     assert len(base) == len(new) <= PAIRS_MAX, f"{len(base)} and {len(new)} are no pairs"
     beyond, pairs = tail(confidence), len(base)
-    least = math.ceil(BEYOND_MIN / beyond - 1e-6)  # 100 at 0.9, whose tail is 0.0499...
-    if resamples < least:
+    if resamples < (least := resamples_least(confidence)):
         raise ConfigError(f"resamples {resamples}: at least {least} are allowed at confidence {confidence:g}")
     if pairs < quantile_needs(q, confidence):
         return None
@@ -86,21 +92,29 @@ def paired_quantile_shift(
 
 # -- Two campaigns of one plan, experiment by experiment --------------------------------------------
 #
-# They are paired by what was to be run (stratum, number, seed, faults), whatever the code was. A stratum is
-# *worse* if significantly more of its pairs fail only in the new campaign, or if the interval of the shift
-# of its p99 recovery lies above 0, and above `SHIFT_MS_MIN`.
+# They are paired by what was to be run (stratum, number, seed, faults), whatever the code was, and wherever
+# the files of a function, of requests or of a scenario lay. A stratum is *worse* if significantly more of its
+# pairs fail only in the new campaign, or if the interval of the shift of its p99 recovery lies above 0, and
+# above `SHIFT_MS_MIN`.
 
 
 SHIFT_MS_MIN: Final = 0.1  # less is of no consequence, however certain
 Q: Final = 0.99
 SEED: Final = 1
+_FOLDERS: Final = re.compile(r"[^\s'\"]*/")
 
 
 class Change(msgspec.Struct, frozen=True):
-    """`p` of McNemar's test over the pairs of which only one failed; `shift_ms` of the p99 recovery."""
+    """`p` of McNemar's test over the pairs of which only one failed; `shift_ms` of the p99 recovery.
+
+    `other_outcome`: how many pairs came to two classes of outcome, whether one failed or not; `unknown`: of
+    these, how many of whose experiments one is inconclusive, or had trouble with the harness.
+    """
 
     stratum: str
     pairs: int
+    other_outcome: int
+    unknown: int
     only_base: int
     only_new: int
     p: float
@@ -109,13 +123,19 @@ class Change(msgspec.Struct, frozen=True):
 
 
 class Comparison(msgspec.Struct, frozen=True):
-    """`unpaired`: experiments that only one of the two has."""
+    """`unpaired`: experiments that only one of the two has; `missing`: those of the base."""
 
     base: str
     new: str
     unpaired: int
+    missing: int
     changes: tuple[Change, ...]
     worse: bool
+
+    @property
+    def same_outcomes(self) -> bool:
+        """Whether each experiment of the base was run again, and came to the same class."""
+        return not self.missing and not any(change.other_outcome for change in self.changes)
 
 
 def compare(base: Ledger, new: Ledger) -> Comparison:
@@ -130,15 +150,25 @@ def compare(base: Ledger, new: Ledger) -> Comparison:
     for key in common:
         pairs[before[key].experiment.stratum].append((before[key], after[key]))
     changes = tuple(_change(name, found, confidence) for name, found in pairs.items())
-    unpaired = len(before) + len(after) - 2 * len(common)
+    missing = len(before) - len(common)
+    unpaired = missing + len(after) - len(common)
     codes = (base.head.code, new.head.code)
-    return Comparison(*codes, unpaired, changes, any(change.worse for change in changes))
+    return Comparison(*codes, unpaired, missing, changes, any(change.worse for change in changes))
 
 
 def _keyed(ledger: Ledger) -> dict[bytes, Result]:
     found = {}
     for result in ledger.results:
-        same = msgspec.structs.replace(result.experiment, id="", expected=())
+        experiment = result.experiment
+        same = msgspec.structs.replace(
+            experiment,
+            id="",
+            expected=(),
+            app=_FOLDERS.sub("", experiment.app),
+            request_file=_FOLDERS.sub("", experiment.request_file),
+            scenario=_FOLDERS.sub("", experiment.scenario),
+            adaptations=tuple(_FOLDERS.sub("", text) for text in experiment.adaptations),
+        )
         found[msgspec.json.encode(same)] = result
     return found
 
@@ -154,7 +184,10 @@ def _change(stratum: str, pairs: list[tuple[Result, Result]], confidence: float)
     ]
     shift = None
     if timed:
-        chance = Random(f"{SEED}/{stratum}")
-        shift = paired_quantile_shift([t for t, _ in timed], [t for _, t in timed], Q, chance, confidence)
+        chance, before, after = Random(f"{SEED}/{stratum}"), [t for t, _ in timed], [t for _, t in timed]
+        resamples = max(RESAMPLES, resamples_least(confidence))  # many strata share the confidence
+        shift = paired_quantile_shift(before, after, Q, chance, confidence, resamples)
     worse = (only_new > only_base and p < 1 - confidence) or (shift is not None and shift.low > SHIFT_MS_MIN)
-    return Change(stratum, len(pairs), only_base, only_new, p, shift, worse)
+    other = [{b.outcome, n.outcome} for b, n in pairs if b.outcome != n.outcome]
+    unknown = sum(not outcomes.isdisjoint(UNKNOWN) for outcomes in other)
+    return Change(stratum, len(pairs), len(other), unknown, only_base, only_new, p, shift, worse)

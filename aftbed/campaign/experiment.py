@@ -9,8 +9,9 @@ a pass (G8).
 import shlex
 import time
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import lru_cache
+from pathlib import Path
 from typing import Annotated, Final
 
 import msgspec
@@ -40,6 +41,7 @@ from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import CarRun, LoadRun, Work, with_names_resolved
+from aftbed.runtime.unix.seal import copy_sealed
 from aftbed.runtime.unix.supervisor_process import warm_up
 from aftbed.runtime.unix.trust import OWN_RUN, Trust, remember, vetted
 from aftbed.search.shrink import shrink
@@ -211,23 +213,28 @@ UNEXCUSED: Final = (
     FTTI,
 )  # checks that hold whatever the faults are
 RUN_SECONDS_MAX: Final = 60.0
+RECORDS_MAX: Final = 20  # of runs that went wrong, kept of a campaign
 REQUESTS_PER_SECOND_MIN: Final = 100.0  # of a closed loop on a busy machine
 
 Keep = Callable[[Result], None]
 
 
-def carry_out(experiment: Experiment, keep: Keep, code: Code = OWN_CODE) -> Result:
+def carry_out(
+    experiment: Experiment, keep: Keep, code: Code = OWN_CODE, records: Path | None = None
+) -> Result:
     """Run it, and `keep` the result before anything of the run is taken down.
 
+    `records`: where the record of a real run is kept, by its id, if it was broken or unexpected.
     `code`: how that of the user is found in a simulated run; for a stranger's, see `refuse_untrusted`.
     Whatever goes wrong in the run is an outcome, `harness_error`. What goes wrong in `keep` is raised.
     """
     began_s = time.monotonic()
     with ExitStack() as standing:
         try:
-            result = (
-                _simulated(experiment, code) if experiment.runtime == "sim" else _real(experiment, standing)
-            )
+            if experiment.runtime == "sim":
+                result = _simulated(experiment, code)
+            else:
+                result = _real(experiment, standing, records)
         except Exception as error:  # noqa: BLE001 - one experiment must not end a campaign
             reason = f"{type(error).__name__}: {error}"[:REASON_MAX]
             result = Result(experiment, "harness_error", activated=False, reasons=(reason,))
@@ -292,7 +299,7 @@ def _simulated(experiment: Experiment, code: Code) -> Result:
     return _result(experiment, evidence, judge(evidence.record, evidence), outcome, reasons)
 
 
-def _real(experiment: Experiment, standing: ExitStack) -> Result:
+def _real(experiment: Experiment, standing: ExitStack, records: Path | None) -> Result:
     """On real processes, whose record is there until `standing` ends."""
     noisy = _probe().noisy()
     evidence = evidence_of(_recorded(experiment, standing), trust=OWN_RUN)
@@ -310,7 +317,12 @@ def _real(experiment: Experiment, standing: ExitStack) -> Result:
     noisy = noisy or starved(end.starved_ms, end.seconds or 0.0) or _excused(result, end.starved_ms)
     noisy = noisy or _probe().noisy()
     result = msgspec.structs.replace(result, starved_ms=end.starved_ms)
-    return without_times(result) if noisy else result
+    result = without_times(result) if noisy else result
+    if records is not None and (result.broken or result.unexpected):
+        with suppress(OSError):  # of a full disk: the result stands without it
+            if not records.is_dir() or sum(1 for _ in records.iterdir()) < RECORDS_MAX:
+                copy_sealed(evidence.record.path, records / experiment.id)
+    return result
 
 
 def _excused(result: Result, starved_ms: float) -> bool:

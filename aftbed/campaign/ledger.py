@@ -8,10 +8,12 @@ full disk or a dead machine left; `resume` cuts it off, all other readers refuse
 
 import os
 import platform
+import re
 import shlex
 import sys
 from collections import Counter
 from collections.abc import Iterable
+from importlib import metadata
 from pathlib import Path
 from typing import Final, TypeVar
 
@@ -25,20 +27,26 @@ from aftbed.core.input_file import read_input
 
 CPUINFO = Path("/proc/cpuinfo")
 NAME: Final = "records.jsonl"
+RECORDS: Final = "runs"  # beside it: the records of real runs that were broken or unexpected, by their ids
 LINE_BYTES_MAX: Final = 1_000_000
 LEDGER_BYTES_MAX: Final = 4 << 30
 OWN: Final = {"digest": "spec", "code": "version of the code", "shard": "shard", "shards": "number of shards"}
+_PACKAGE: Final = re.compile(r"[A-Za-z0-9._-]+")
 
 T = TypeVar("T")
 
 
 class Environment(msgspec.Struct, frozen=True):
-    """On what a campaign was run: versions, machine, and the command that it was started with."""
+    """On what a campaign was run: versions, machine, and the command that it was started with.
+
+    `packages`: the versions of those that aftbed needs, by name.
+    """
 
     python: str
     kernel: str
     cpus: str
     command: str
+    packages: dict[str, str] = {}
 
 
 def here() -> Environment:
@@ -54,7 +62,18 @@ def here() -> Environment:
         f"{platform.system()} {platform.release()}",
         f"{usable} of {os.cpu_count()}, {next(models, platform.machine())}",
         shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        _packages(),
     )
+
+
+def _packages() -> dict[str, str]:
+    """None where aftbed is not installed, but only on the path of Python."""
+    try:
+        wanted = [_PACKAGE.match(text) for text in metadata.requires("aftbed") or () if ";" not in text]
+        names = sorted(match[0] for match in wanted if match)
+        return {name: metadata.version(name) for name in names}
+    except metadata.PackageNotFoundError:
+        return {}
 
 
 class Head(msgspec.Struct, frozen=True):

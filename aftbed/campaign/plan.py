@@ -5,8 +5,8 @@ with the number n takes the nth point of the stratum's matrix (then the first ag
 generator of its own: `Random(f"{seed}/{stratum}/{n}")`. So neither the number of jobs nor the order in
 which they end has a part in what is run.
 
-The digest covers the file of the requests and the code of the functions, too: a function that was changed
-makes another campaign.
+The digest covers the files of the requests and of the scenario, and the code of the functions, too: a
+function that was changed makes another campaign.
 """
 
 import hashlib
@@ -45,6 +45,7 @@ from aftbed.judge.isolated import declared_by
 from aftbed.runtime.unix.code_version import code_version
 from aftbed.runtime.unix.trust import NOBODY, OWN_RUN, Trust, vetted
 from aftbed.vehicle.aeb.function import default_application
+from aftbed.vehicle.scenarios.library import load_scenario, names_file
 
 ID_DIGITS: Final = 16
 SEED_BITS: Final = 31
@@ -143,12 +144,15 @@ def _content(spec: Spec) -> bytes:
     """
     system, found = spec.system, hashlib.sha256()
     functions = [system.app, system.request_file if names_function(system.request_file) else ""]
-    if not any((system.app, system.request_file)):
+    scenario = load_scenario(system.scenario) if names_file(system.scenario) else None
+    if not any((system.app, system.request_file, scenario)):
         return b""
     for source in filter(None, functions):
         found.update(b"".join(file.sha256.encode() for file in vetted(source, OWN_RUN).files))
     if system.request_file and not functions[1]:
         found.update(msgspec.msgpack.encode(read_requests(Path(system.request_file)).requests))
+    if scenario is not None:
+        found.update(msgspec.msgpack.encode(scenario))
     return found.digest()
 
 

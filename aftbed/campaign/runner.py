@@ -135,7 +135,8 @@ def _perform(path: str, experiment: Experiment) -> Result:
     """In a worker."""
     descriptor = ledger.opened(Path(path))
     try:
-        return carry_out(experiment, partial(ledger.append, descriptor))
+        keep = partial(ledger.append, descriptor)
+        return carry_out(experiment, keep, records=Path(path).parent / ledger.RECORDS)
     finally:
         os.close(descriptor)
 

@@ -4,6 +4,7 @@ Statistics and reports need scipy and Jinja2 (0.4 s, 30 MB), so they are importe
 """
 
 import re
+import shutil
 import sys
 import time
 from contextlib import closing
@@ -14,7 +15,7 @@ from typing import Annotated, Final
 
 import msgspec
 import typer
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 
 from aftbed.campaign import ledger, runner
 from aftbed.campaign.experiment import REQUESTS_MAX, Result, carry_out, refuse_untrusted, smallest
@@ -27,6 +28,7 @@ from aftbed.cli.options import (
     Json,
     Requests,
     TrustedFolders,
+    check_file,
     check_range,
     jobs_of,
     print_json,
@@ -46,15 +48,12 @@ RUNTIMES: Final = ("unix", "sim")
 EXECUTORS: Final = ("local", "dask")
 SECONDS_EACH: Final = {"unix": 0.35, "sim": 0.01}  # of an experiment on one core: for the estimate of `plan`
 EXIT_CODES: Final = {"pass": 0, "fail": 1}
-SUMMARY: Final = "summary.json"
-JUNIT: Final = "junit.xml"
-HTML: Final = "report.html"
-MARKDOWN: Final = "summary.md"  # of a campaign with a function of the user
 _SHARD: Final = re.compile(r"([0-9]{1,6})/([0-9]{1,6})")
 
 campaign = typer.Typer(cls=PlainGroup)
 
 Folder = Annotated[Path, typer.Argument(help="The directory of a campaign (its --out).")]
+BundleFile = Annotated[Path, typer.Argument(metavar="BUNDLE", help="A file of aftbed campaign bundle.")]
 ExperimentName = Annotated[str, typer.Argument(help="Id of the experiment, its beginning, or its number.")]
 
 
@@ -250,25 +249,15 @@ def _ledger(folder: Path) -> ledger.Ledger:
 def _judge(folder: Path, size: int, seconds: float, *, as_json: bool) -> int:
     """Summarise the ledger, of a campaign of `size` experiments, and write the reports; the exit code."""
     from aftbed.campaign.summary import summarise  # noqa: PLC0415
-    from aftbed.report.html import html_report  # noqa: PLC0415 - scipy
-    from aftbed.report.junit import junit_xml  # noqa: PLC0415
-    from aftbed.report.markdown import markdown_summary  # noqa: PLC0415
+    from aftbed.report.documents import documents  # noqa: PLC0415 - scipy
     from aftbed.report.terminal import summary_lines  # noqa: PLC0415
 
     records = _ledger(folder)
     summary = summarise(records, size, seconds)
-    document = msgspec.json.encode(summary)
-    reports = {
-        SUMMARY: msgspec.json.format(document).decode(),
-        JUNIT: junit_xml(summary, records),
-        HTML: html_report(summary, records),
-    }
-    if records.head.spec.system.app:
-        reports[MARKDOWN] = markdown_summary(summary, records.head.spec.system.app)
-    for name, text in reports.items():
+    for name, text in documents(summary, records).items():
         write_text_whole(folder / name, text)
     if as_json:
-        print(document.decode())
+        print(msgspec.json.encode(summary).decode())
     else:
         print("\n".join(summary_lines(summary)))
         print(f"records and reports: {folder}")
@@ -318,11 +307,24 @@ def merge(
     ledger.begin(path, merged.head)
     with open(ledger.opened(path), "wb") as file:
         file.writelines(msgspec.json.encode(result) + b"\n" for result in merged.results)
+    for records in (folder / ledger.RECORDS for folder in folders):
+        try:
+            if records.is_dir():
+                shutil.copytree(records, out / ledger.RECORDS, symlinks=True, dirs_exist_ok=True)
+        except OSError as error:  # of copytree, a list of what could not be copied
+            raise ConfigError(f"{records}: cannot be copied to {out}: {error}") from None
     raise typer.Exit(_report(out, as_json=json))
 
 
 @campaign.command()
-def compare(base: Folder, new: Folder, json: Json = False) -> None:
+def compare(
+    base: Folder,
+    new: Folder,
+    outcomes: Annotated[
+        bool, typer.Option("--outcomes", help="Fail where an experiment has another outcome, or is missing.")
+    ] = False,
+    json: Json = False,
+) -> None:
     """What differs between two campaigns of the same plan, experiment by experiment.
 
     Exit code: 0 no stratum has become worse, 1 one has, 2 usage.
@@ -334,7 +336,9 @@ def compare(base: Folder, new: Folder, json: Json = False) -> None:
         shift = "p99 recovery: too few to tell"
         if change.shift_ms is not None:
             shift = f"p99 recovery {change.shift_ms.low:+.3f} to {change.shift_ms.high:+.3f} ms"
-        differ = f"{change.only_base} failed only before, {change.only_new} only now (p {change.p:.3g})"
+        differ = f"{change.other_outcome} with another outcome"
+        differ += f" ({change.unknown} unknown)" if change.unknown else ""
+        differ += f", {change.only_base} failed only before, {change.only_new} only now (p {change.p:.3g})"
         word = "worse" if change.worse else "same or better"
         return f"  {change.stratum:<{width}}  {change.pairs:>5} pairs: {differ}; {shift}: {word}"
 
@@ -345,7 +349,7 @@ def compare(base: Folder, new: Folder, json: Json = False) -> None:
         head = f"base {found.base}, new {found.new}; {found.unpaired} experiments without their pair"
         width = max((len(change.stratum) for change in found.changes), default=0)
         print(shown("\n".join((head, *map(line, found.changes)))))
-    raise typer.Exit(1 if found.worse else 0)
+    raise typer.Exit(1 if found.worse or (outcomes and not found.same_outcomes) else 0)
 
 
 @campaign.command()
@@ -354,6 +358,79 @@ def assumptions(folder: Folder, trust: TrustedFolders = None) -> None:
     from aftbed.campaign.assumptions import markdown  # noqa: PLC0415 - scipy
 
     print(shown(markdown(_ledger(folder), trusting(trust))), end="")
+
+
+# -- evidence that can be filed -------------------------------------------------------------------
+
+
+@campaign.command()
+def bundle(
+    folders: Annotated[list[Path], typer.Argument(help="The directories of campaigns.")],
+    out: Annotated[Path, typer.Option(help="A file: .zip.")],
+    trust: TrustedFolders = None,
+    json: Json = False,
+) -> None:
+    """All that campaigns are evidence by, as an archive that can be verified and run again."""
+    from aftbed.report.bundle import SUMS, archive_of, entries, sha256  # noqa: PLC0415 - scipy
+
+    check_file("--out", out, ".zip")
+    made = entries([_ledger(folder) for folder in folders], trusting(trust))
+    data = archive_of(made)
+    write_whole(out, lambda path: path.write_bytes(data))
+    files = {name: sha256(entry.data) for name, entry in made.items() if name != SUMS}
+    if json:
+        print_json({"bundle": out.name, "sha256": sha256(data), "files": files})
+    else:
+        print(shown(f"{out}: {len(files)} files, sha256 {sha256(data)}"))
+
+
+@campaign.command()
+def verify(file: BundleFile, json: Json = False) -> None:
+    """Whether each file of a bundle fits its hash. Nothing is unpacked.
+
+    Exit code: 0 all fit, 1 one does not, 2 no bundle.
+    """
+    from aftbed.report.bundle import verified  # noqa: PLC0415 - scipy
+
+    found = verified(file)
+    if json:
+        print_json({"bundle": file.name} | asdict(found))
+    else:
+        lines = [f"{file}: {len(found.files)} files, sha256 {found.sha256}"]
+        lines += [f"{one.path}: {one.why}" for one in found.misfits] or ["all fit"]
+        print(shown("\n".join(lines)))
+    raise typer.Exit(1 if found.misfits else 0)
+
+
+@campaign.command()
+def argument(
+    file: BundleFile,
+    plot: Annotated[Path | None, typer.Option(help="Draw it to this SVG file.")] = None,
+    json: Json = False,
+) -> None:
+    """A safety argument from a bundle, in GSN: promises, mechanisms, what was measured, and its hash.
+
+    Exit code: 0 each campaign supports its goals, 1 one does not, or a file does not fit its hash, 2 usage.
+    """
+    from aftbed.report.argument import argument_lines, argument_of  # noqa: PLC0415 - scipy
+    from aftbed.report.bundle import campaigns_in, verified  # noqa: PLC0415
+
+    check_file("--plot", plot, ".svg")
+    checked = verified(file)
+    if checked.misfits:
+        for one in checked.misfits:
+            print(shown(f"aftbed: {file}: {one.path}: {one.why}"), file=sys.stderr)
+        raise typer.Exit(1)
+    found = argument_of(file.name, checked, campaigns_in(file))
+    if plot is not None:
+        from aftbed.report.gsn import gsn_svg  # noqa: PLC0415
+
+        write_text_whole(plot, gsn_svg(found))
+    if json:
+        print_json(found)
+    else:
+        print(shown("\n".join(argument_lines(found))))
+    raise typer.Exit(0 if found.holds else 1)
 
 
 # -- one experiment -------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from aftbed.cli.parsing import PlainGroup
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, shown
 
 log = typer.Typer(cls=PlainGroup)
 
@@ -17,23 +17,30 @@ def convert(
     sink: Annotated[Path, typer.Argument(help="The file to write.")],
     from_format: Annotated[
         str | None,
-        typer.Option("--from", help="candump, asc, blf, trc or mf4, if SOURCE's ending does not say."),
+        typer.Option(
+            "--from", help="candump, asc, blf, trc, mf4 or csv (by frame), if SOURCE's ending does not say."
+        ),
     ] = None,
     to_format: Annotated[
         str | None,
-        typer.Option("--to", help="One of these or csv (by signal), if SINK's ending does not say."),
+        typer.Option("--to", help="One of these, csv by signal, if SINK's ending does not say."),
     ] = None,
     dbc: Annotated[
-        Path | None, typer.Option(help="The DBC of the frames, for csv; aftbed's own if left out.")
+        Path | None, typer.Option(help="The DBC of the frames, to write csv; aftbed's own if left out.")
     ] = None,
+    skip_bad: Annotated[
+        bool, typer.Option("--skip-bad", help="Leave out what cannot be read of SOURCE, and count it.")
+    ] = False,
 ) -> None:
     """Write a log of a CAN bus in another format."""
     from aftbed.interop.logs import convert as convert_log  # noqa: PLC0415 - imports python-can
 
-    done = convert_log(source, sink, from_format, to_format, dbc)
+    done = convert_log(source, sink, from_format, to_format, dbc, skip_bad=skip_bad)
     print(f"{sink}: {done.frames} frames, {done.source} to {done.sink}")
     for reason, count in done.left_out.items():
         print(f"  left out: {count} times {reason}")
+    if done.skipped:
+        print(shown(f"  skipped: {done.skipped} bad parts, the first at {done.first_skipped}"))
 
 
 @log.command()

@@ -13,7 +13,6 @@ import typer
 from aftbed.cli.options import Json, check_file, print_json
 from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError, shown
-from aftbed.vehicle.can.candump import read_log
 from aftbed.vehicle.can.dbc_file import load_dbc
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.replay.map_file import (
@@ -32,7 +31,7 @@ from aftbed.vehicle.replay.map_trial import Decoded, Span, try_out
 
 maps = typer.Typer(cls=PlainGroup)
 
-Log = Annotated[Path | None, typer.Option(metavar="LOG", help="A candump log of the same bus, to try it on.")]
+Log = Annotated[Path | None, typer.Option(metavar="LOG", help="A log of the same bus, to try it on.")]
 
 
 class UsedMessage(msgspec.Struct, frozen=True):
@@ -153,8 +152,11 @@ def _write(path: Path, proposal: MapProposal) -> None:
 # -- both -----------------------------------------------------------------------------------------
 
 
-def _frames(log: Path) -> list[Frame]:
-    return [entry.frame for entry in read_log(log)[0]]
+def _frames(log: Path) -> Sequence[Frame]:
+    """As a replay has them; what cannot be read does not matter here. Raises ConfigError."""
+    from aftbed.interop.logs import read_for_replay  # noqa: PLC0415 - only with --log
+
+    return read_for_replay(log, skip_bad=True).frames
 
 
 def _used(bound: BoundMap) -> list[UsedMessage]:

@@ -44,6 +44,7 @@ from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
+from aftbed.core.units import whole_milliseconds
 from aftbed.ftm.compose import build, canonical
 from aftbed.functions.source import located
 from aftbed.inject.memory import refuse_unsafe
@@ -101,9 +102,21 @@ class RunArguments(msgspec.Struct, frozen=True):
     record: Annotated[str | None, typer.Option(help="Keep the record of the run in this new directory.")] = (
         None
     )
-    replay: Annotated[str | None, typer.Option(help="A candump log to replay instead of a drive.")] = None
+    replay: Annotated[
+        str | None, typer.Option(help="A log to replay instead of a drive: candump, ASC, BLF, TRC, MF4, CSV.")
+    ] = None
+    skip_bad: Annotated[
+        bool, typer.Option("--skip-bad", help="Leave out what cannot be read of --replay, and count it.")
+    ] = False
     dbc: Annotated[str | None, typer.Option(help="The DBC of the replayed log.")] = None
     map_file: Annotated[str | None, typer.Option("--map", help="What the log's signals mean.")] = None
+    loop: Annotated[bool, typer.Option("--loop", help="Begin the log of --replay again behind its end.")] = (
+        False
+    )
+    duration: Annotated[
+        str | None,
+        typer.Option(help="End after so long, of bus time, e.g. 90s; else as scenario or log say."),
+    ] = None
     load: Annotated[
         str | None, typer.Option(help="COUNT[@RATE]: synthetic requests (per second) instead of a drive.")
     ] = None
@@ -144,8 +157,9 @@ class RunArguments(msgspec.Struct, frozen=True):
 
 
 DEFAULTS: Final = RunArguments()
-OTHER_SOURCES: Final = ("load", "replay", "dbc", "map_file", "scenario", "pace", "brake_policy")
-OF_THE_BUS: Final = ("bus_port", "bus_open")
+OF_A_REPLAY: Final = ("dbc", "map_file", "skip_bad", "loop")
+OTHER_SOURCES: Final = ("load", "replay", *OF_A_REPLAY, "scenario", "pace", "brake_policy")
+OF_THE_BUS: Final = ("bus_port", "bus_open", "duration")
 
 
 @takes(RunArguments)
@@ -172,6 +186,7 @@ def execute(given: RunArguments) -> int:
     work = _work(given) if source is None else _sent(source, given)
     ftti_ms = ftti_ms_of("--ftti", given.ftti, work) if given.ftti is not None else 0.0
     requests = source.of(given.seed) if source is not None else None
+    log = _log(given)
     if application:
         _refuse_unsuitable(application, graph.ftm, requests, force=given.force)
     check_range("--bus-port", given.bus_port, 0, 65535)
@@ -198,7 +213,8 @@ def execute(given: RunArguments) -> int:
         command=shlex.join(("aftbed", *sys.argv[1:])),
         evidence=given.junit is not None,
     )
-    launched = launch(options, listener, requests)
+    launched = launch(options, listener, requests, log)
+    del log  # it may be large, and the run has it
     try:
         closed = make_loop(launched) if make_loop is not None else None
         with page(launched.private):
@@ -278,27 +294,35 @@ def _work(given: RunArguments) -> Work:
     if given.replay is not None and given.load is not None:
         raise ConfigError("--replay and --load: one of them is allowed")
     if given.load is not None:
-        _refuse(given, ("scenario", "pace", "brake_policy"), "--load: there is no car: leave out")
+        _refuse(
+            given, ("scenario", "pace", "brake_policy", *OF_A_REPLAY), "--load: there is no car: leave out"
+        )
         if given.bus_open:
             raise ConfigError("--bus-open: a run of --load has no bus")
+        if given.duration is not None:
+            raise ConfigError("--duration: a run of --load ends with its last request; COUNT says how many")
         return _load(given.load)
     pace = _pace(given.pace)
+    duration_ms = whole_milliseconds("--duration", given.duration) if given.duration is not None else None
     if given.replay is not None:
-        return _replay(given.replay, given.dbc, given.map_file, pace)
-    if given.dbc is not None or given.map_file is not None:
-        raise ConfigError("--dbc and --map say what a replayed log means: give --replay LOG too")
+        _refuse(given, ("scenario", "brake_policy"), "--replay: there is no car: leave out")
+        if given.loop and pace is None and duration_ms is None:
+            raise ConfigError("--loop with --pace max would fill the disk: give --duration too")
+        files = _replay_files(given.replay, given.dbc, given.map_file)
+        return ReplayRun(*files, pace, given.loop, duration_ms)
+    _refuse(given, OF_A_REPLAY, "only with --replay LOG: leave out")
     if given.brake_policy not in POLICIES:
         raise unknown("brake policy", given.brake_policy, POLICIES)
     scenario = given.scenario
     if scenario.endswith((".yaml", ".yml")):
         scenario = str(Path(scenario).resolve())
-    return CarRun(scenario, pace, given.brake_policy)
+    return CarRun(scenario, pace, given.brake_policy, duration_ms)
 
 
-def _replay(log: str, dbc_name: str | None, map_name: str | None, pace: float | None) -> ReplayRun:
+def _replay_files(log: str, dbc_name: str | None, map_name: str | None) -> tuple[str, str, str]:
+    """Log, DBC and map, as a ReplayRun has them. Raises ConfigError."""
     if dbc_name is None or map_name is None:
         raise ConfigError("--replay LOG needs --dbc FILE and --map FILE, which say what its frames mean")
-    from aftbed.vehicle.can.candump import read_log  # noqa: PLC0415 - only with --replay
     from aftbed.vehicle.replay.map_file import (  # noqa: PLC0415 - only with --replay
         bind,
         find_dbc,
@@ -307,8 +331,16 @@ def _replay(log: str, dbc_name: str | None, map_name: str | None, pace: float | 
 
     dbc, map_path = find_dbc(dbc_name), find_map(map_name)
     bind(map_path, dbc)
-    read_log(Path(log))
-    return ReplayRun(str(Path(log).resolve()), str(dbc.resolve()), str(map_path), pace)
+    return str(Path(log).resolve()), str(dbc.resolve()), str(map_path)
+
+
+def _log(given: RunArguments) -> bytes | None:
+    """The log of `--replay`, as the player takes it; None without one."""
+    if given.replay is None:
+        return None
+    from aftbed.interop.logs import read_for_replay  # noqa: PLC0415 - only with --replay
+
+    return msgspec.msgpack.encode(read_for_replay(Path(given.replay), skip_bad=given.skip_bad))
 
 
 def _pace(text: str) -> float | None:

@@ -16,6 +16,7 @@ import msgspec
 from aftbed.cli.options import print_json
 from aftbed.core.errors import shown
 from aftbed.runtime.unix.options import RunOptions
+from aftbed.vehicle.can.bus_model import CHANNEL, HOST
 from aftbed.vehicle.plant import Telemetry
 
 if TYPE_CHECKING:
@@ -68,6 +69,8 @@ class PlainView(RunView):
 
     def __init__(self, options: RunOptions) -> None:
         print(f"run {options.run}: {options.ftm}, {options.placement}, seed {options.seed}", flush=True)
+        if options.port:
+            print(_bus(options), flush=True)
         self._next_ms = 0
 
     def telemetry(self, data: bytes) -> None:
@@ -85,6 +88,7 @@ class LiveView(RunView):
 
     def __init__(self, options: RunOptions) -> None:
         self._title = f"aftbed run {options.run}: {options.ftm}, {options.placement}"
+        self._bus = [_bus(options)] if options.port else []
         self._events: deque[str] = deque(maxlen=EVENTS_SHOWN)
         self._telemetry: Telemetry | None = None
         self._roles = "a leads, b backs up" if options.ftm != "none" else "a alone"
@@ -108,9 +112,13 @@ class LiveView(RunView):
 
         car = _car(self._telemetry) if self._telemetry else "waiting for the car"
         road = _road(self._telemetry.gap_m if self._telemetry else None)
-        lines = [car, road, f"replicas: {self._roles}{self._cycle}", "", *self._events]
+        lines = [car, road, f"replicas: {self._roles}{self._cycle}", *self._bus, "", *self._events]
         text = Text("\n".join(lines), no_wrap=True, overflow="ellipsis")
-        return Panel(text, title=self._title, height=EVENTS_SHOWN + 6)
+        return Panel(text, title=self._title, height=EVENTS_SHOWN + 6 + len(self._bus))
+
+
+def _bus(options: RunOptions) -> str:
+    return f"bus: {CHANNEL} at {HOST}:{options.port}, for clients of socketcand"
 
 
 def _car(t: Telemetry) -> str:

@@ -45,9 +45,25 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+$"), list("-+0123456789")
-)
+class _Dumper(yaml.SafeDumper):
+    """Quotes what `_Loader` would take for a number, and repeats what stands twice."""
+
+    def ignore_aliases(self, data: object) -> bool:
+        return True
+
+
+for _one in (_Loader, _Dumper):
+    _one.add_implicit_resolver(
+        "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+$"), list("-+0123456789")
+    )
+
+
+def yaml_text(found: msgspec.Struct) -> str:
+    """What `read_yaml` reads as `found`, with every key, defaults too. Raises ConfigError if it is long."""
+    text: str = yaml.dump(msgspec.to_builtins(found), Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+    if len(text.encode()) > YAML_BYTES_MAX:
+        raise ConfigError(f"{len(text.encode())} bytes of YAML, allowed are {YAML_BYTES_MAX}")
+    return text
 
 
 def read_yaml(path: Path, shape: type[S]) -> S:

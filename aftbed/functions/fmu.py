@@ -25,7 +25,6 @@ import sys
 import tempfile
 import weakref
 import zipfile
-import zlib
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
@@ -37,8 +36,8 @@ from xml.etree import ElementTree
 import msgspec
 
 from aftbed.core.application import STATE_BYTES_MAX, AccessKind, Application, Characteristics, Field
+from aftbed.core.archive import ArchiveLimits, opened_archive
 from aftbed.core.errors import ConfigError, FunctionFailedError, PeerError, shown
-from aftbed.core.input_file import open_input
 from aftbed.core.yaml_file import read_yaml
 from aftbed.functions.ports import Kind, Ports, PortsFile, Value, Variable, bind
 
@@ -404,45 +403,10 @@ class Description(msgspec.Struct, frozen=True):
     variables: tuple[Variable, ...]
 
 
-@contextlib.contextmanager
-def _opened(model: Path) -> Iterator[tuple[BinaryIO, zipfile.ZipFile]]:
+def _opened(model: Path) -> contextlib.AbstractContextManager[tuple[BinaryIO, zipfile.ZipFile]]:
     """The archive, its members checked. Raises ConfigError, also for what goes wrong with it in the block."""
-    try:
-        with open_input(model) as file:
-            size_bytes = os.fstat(file.fileno()).st_size
-            if size_bytes > ARCHIVE_BYTES_MAX:
-                raise ConfigError(f"{model}: found {size_bytes} bytes, allowed are {ARCHIVE_BYTES_MAX}")
-            with zipfile.ZipFile(file) as archive:
-                _check_members(model, archive)
-                yield file, archive
-    except OSError as error:
-        raise ConfigError(f"{model}: cannot be read: {error.strerror or error}") from error
-    except (zipfile.BadZipFile, zlib.error, EOFError, struct.error, ValueError) as error:
-        raise ConfigError(f"{model}: found no zip archive, as an FMU is, or a broken one: {error}") from error
-    except (NotImplementedError, RuntimeError) as error:  # another compression, encrypted
-        raise ConfigError(f"{model}: its archive cannot be read: {error}") from error
-
-
-def _check_members(model: Path, archive: zipfile.ZipFile) -> None:
-    members = archive.infolist()
-    if len(members) > MEMBERS_MAX:
-        raise ConfigError(f"{model}: found {len(members)} members, allowed are {MEMBERS_MAX}")
-    total = sum(one.file_size for one in members)
-    if total > UNPACKED_BYTES_MAX:
-        raise ConfigError(f"{model}: found {total} bytes when unpacked, allowed are {UNPACKED_BYTES_MAX}")
-    seen: set[str] = set()
-    for one in members:
-        name = one.orig_filename
-        parts = name.removesuffix("/").split("/")
-        if "\\" in name or "\0" in name or any(part in ("", ".", "..") for part in parts):
-            raise ConfigError(
-                f"{model}: found the member {name!r}, allowed are paths below the FMU, with slashes"
-            )
-        if stat.S_IFMT(one.external_attr >> 16) not in (0, stat.S_IFREG, stat.S_IFDIR):
-            raise ConfigError(f"{model}: found {name!r}, a link or device, allowed are files and directories")
-        if name in seen:
-            raise ConfigError(f"{model}: found the member {name!r} twice, allowed is once")
-        seen.add(name)
+    limits = ArchiveLimits(ARCHIVE_BYTES_MAX, UNPACKED_BYTES_MAX, MEMBERS_MAX)
+    return opened_archive(model, "an FMU", limits)
 
 
 def _described(model: Path) -> Description:

@@ -151,7 +151,7 @@ def _replay(record: RunRecord) -> list[str] | None:
 
 
 def _drive(record: RunRecord) -> list[str] | None:
-    """A drive ends at a standstill or a collision, or when the scenario says: slow enough, or long enough."""
+    """A drive ends at a standstill, in a collision, as slow as its scenario says, or after as long as it may."""
     work, drive = record.options.work, record.drive
     if not isinstance(work, CarRun) or not _ended_by_itself(record) or drive is None:
         return None  # without a drive the car did not report: `vehicle` tells
@@ -161,8 +161,9 @@ def _drive(record: RunRecord) -> list[str] | None:
             return [f"the drive was stopped after {lasted_s:g} s, which was not asked for"]
         case "slow" if scenario.slow_end is None:
             return [f"the drive ended after {lasted_s:g} s because the car was slow, which was not asked for"]
-        case "duration" if lasted_s < (lasts_s := scenario.duration_ms / 1e3):
-            return [f"the drive ended after {lasted_s:g} of {lasts_s:g} s"]
+        case "duration":
+            lasts_s = (work.duration_ms or scenario.duration_ms) / 1e3
+            return [f"the drive ended after {lasted_s:g} of {lasts_s:g} s"] if lasted_s < lasts_s else []
     return []
 
 

@@ -165,7 +165,7 @@ def read_record(path: Path, *, in_memory: bool = False) -> RunRecord:
     about = _json(path / "run.json")
     given = {key: value for key, value in about.items() if key not in BESIDE_OPTIONS}
     what = f"{path / 'run.json'}: not the options of a run"
-    options = _exactly(given | {"private": "", "listener": -1}, RunOptions, what)
+    options = _exactly(given | {"private": "", "listener": -1, "log": -1}, RunOptions, what)
     check_requirements(f"{path / 'run.json'}: verifies", options.verifies)
     try:
         started = msgspec.convert(about.get("started_ns"), int)

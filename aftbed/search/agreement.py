@@ -82,6 +82,8 @@ def setup_of(record: RunRecord) -> Setup:
         case LoadRun(count, rate_hz) as load:
             given = _given(record, load.requests) if load.requests else None
             return msgspec.structs.replace(same, count=count, rate_hz=rate_hz, given=given)
+        case CarRun(duration_ms=int()):
+            raise ConfigError(f"{record.path}: a drive of --duration is not simulated")
         case CarRun() as car:
             return msgspec.structs.replace(same, scenario=car.scenario)
         case _:

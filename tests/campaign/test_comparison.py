@@ -1,14 +1,18 @@
 """Two campaigns of one plan, compared pair by pair."""
 
 from math import comb
+from pathlib import Path
 from random import Random
 from typing import Final
 
+import msgspec
 import pytest
+from campaigns import planned, result
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.campaign.compare import mcnemar, paired_quantile_shift
+from aftbed.campaign.compare import compare, mcnemar, paired_quantile_shift
+from aftbed.campaign.ledger import Ledger, head_of
 from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import ConfigError
 
@@ -135,3 +139,27 @@ def test_what_is_asked_for_wrongly_is_named() -> None:
         paired_quantile_shift(times, times, 0.5, Random(SEED), resamples=10)
     with pytest.raises(AssertionError, match=r"^10 and 9 are no pairs"):
         paired_quantile_shift(times, times[1:], 0.5, Random(SEED))
+
+
+def test_experiments_are_a_pair_wherever_the_files_of_their_function_lie(tmp_path: Path) -> None:
+    head = head_of(planned(tmp_path))
+
+    def in_folder(folder: str) -> Ledger:
+        one = result()
+        text = f"update app to {folder}/./brake.py:Brake at request 3"
+        there = msgspec.structs.replace(
+            one.experiment, app=f"{folder}/brake.py:Brake", scenario=f"{folder}/s.yaml", adaptations=(text,)
+        )
+        return Ledger(tmp_path, head, (msgspec.structs.replace(one, experiment=there),))
+
+    found = compare(in_folder("/a"), in_folder("/b/c"))
+    assert found.unpaired == 0 and found.same_outcomes
+
+
+def test_a_campaign_of_many_strata_is_compared(tmp_path: Path) -> None:
+    """Each stratum has a part of the confidence, and so the more resamples."""
+    results = tuple(
+        result(stratum=f"pbr · {n % 40}", index=n, recovery_ms=2.0 + n % 3) for n in range(40 * 3)
+    )
+    found = Ledger(tmp_path, head_of(planned(tmp_path)), results)
+    assert [change.pairs for change in compare(found, found).changes] == [3] * 40

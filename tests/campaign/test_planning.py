@@ -39,6 +39,25 @@ def test_another_file_gives_other_ids(tmp_path: Path, change: tuple[str, str]) -
     assert not {e.id for e in first.experiments()} & {e.id for e in other.experiments()}
 
 
+TOWN = """
+description: a standing car
+duration_s: 8
+ego: {speed_kmh: 30}
+lead: {ttc_s: 3.0, speed_kmh: 0}
+expect: {outcome: stop}
+"""
+
+
+def test_another_scenario_in_the_same_file_is_another_campaign(tmp_path: Path) -> None:
+    town = tmp_path / "town.yaml"
+    text = CRASHES.replace("requests: 30, ", f"scenario: {town}, ")
+    digests = set()
+    for scenario in (TOWN, TOWN, TOWN.replace("3.0", "3.5")):
+        town.write_text(scenario)
+        digests.add(planned(tmp_path, text).digest)
+    assert len(digests) == 2
+
+
 def test_more_experiments_leave_the_first_as_they_were(tmp_path: Path) -> None:
     """What is drawn depends on the stratum and the number alone."""
     few, many = planned(tmp_path), planned(tmp_path, CRASHES.replace("experiments: 4", "experiments: 9"))

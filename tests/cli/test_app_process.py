@@ -74,20 +74,30 @@ def test_usage_is_exit_code_2(home: Home, option: tuple[str, ...]) -> None:
     assert home.left() == []
 
 
-def test_a_log_is_replayed_without_its_damaged_lines(home: Home, tmp_path: Path) -> None:
-    """They are counted and refused; the frames around them are replayed."""
-    good = [f"(000000000{n}.000000) can0 210#{n:02X}00000000000000\n" for n in range(1, 6)]
-    lines = [*good[:3], "garbage\n", "(0000000001.000000) can0 210#00\n", *good[3:], good[4][:-9]]
+@pytest.mark.parametrize("ending", ["log", "asc"])
+def test_a_log_is_replayed_without_what_the_bus_does_not_carry(
+    ending: str, home: Home, tmp_path: Path
+) -> None:
+    """And without damaged lines, as --skip-bad asks: both are counted; the frames around are replayed."""
+    good = [f"(000000000{n}.000000) can0 210#{n:02X}00000000000000_F\n" for n in range(1, 6)]
+    others = [f"(0000000004.500000) can0 {text}\n" for text in ("210##0", "00000210#", "210#R", "20000004#")]
+    lines = [*good[:3], "garbage\n", "(0000000001.000000) can0 210#00\n", *good[3:4], *others, good[4]]
     log, dbc, mapped = tmp_path / "x.log", tmp_path / "x.dbc", tmp_path / "x.yaml"
-    log.write_text("".join(lines))
+    log.write_text("".join([*lines, good[4][:-9]]))
+    if ending == "asc":
+        log = tmp_path / "x.asc"
+        assert aftbed("log", "convert", tmp_path / "x.log", log, "--skip-bad").code == 0
+        log.write_text(log.read_text().replace("End", " 5.1 1  210  Rx  d 8 XX\nEnd"))
     dbc.write_text(DBC)
     mapped.write_text(MAP)
-    done = aftbed("run", "--replay", log, "--dbc", dbc, "--map", mapped, "--pace", "max", "--json")
+    words = ("run", "--replay", log, "--dbc", dbc, "--map", mapped, "--pace", "max", "--json")
+    refused = aftbed(*words)
+    assert refused.code == 2 and "--skip-bad leaves out such parts" in refused.err
+    done = aftbed(*words, "--skip-bad")
     assert done.code == 0, done.out + done.err
-    counts = json.loads(done.out)["replay"]["log"]
-    assert counts["refused"] == {
-        "not a candump line": 1,
-        "time runs backwards": 1,
-        "torn last line": 1,
-    }
-    assert counts["frames"] == 5
+    replay = json.loads(done.out)["replay"]
+    kinds = ("CAN FD frame", "29-bit identifier", "remote frame", "error frame", "time runs backwards")
+    torn = {"torn last line": 1} if ending == "log" else {}
+    assert replay["log"]["left_out"] == torn | dict.fromkeys(kinds, 1)
+    assert (replay["log"]["frames"], replay["log"]["skipped"], replay["played"]["sent"]) == (5, 1, 5)
+    assert replay["gateway"]["accepted"] == 5

@@ -84,9 +84,17 @@ def all_words(error: str, *words: str) -> bool:
         (("--bus-port", "65536"), ("--bus-port 65536", "0 to 65535")),
         (("--bus-port", "-1"), ("--bus-port -1", "0 to 65535")),
         (("--bus-open", "--load", "10"), ("--bus-open: a run of --load has no bus",)),
+        (("--loop",), ("only with --replay LOG: leave out --loop",)),
+        (("--replay", "x", "--loop", "--pace", "max"), ("--loop with --pace max", "give --duration too")),
+        (("--duration", "0s"), ("--duration '0s': a positive number with its unit is allowed",)),
+        (("--duration", "2h"), ("--duration '2h'",)),
+        (("--duration", "2s", "--load", "10"), ("--duration: a run of --load ends with its last request",)),
+        (("--duration", "2s", "--requests", "x.csv"), ("leave out --duration",)),
+        (("--dbc", "x.dbc"), ("only with --replay LOG: leave out --dbc",)),
         (("--load", "10", "--scenario", "ccrs-20"), ("--load: there is no car: leave out --scenario",)),
         (("--load", "10", "--pace", "max"), ("--load: there is no car: leave out --pace",)),
-        (("--dbc", "x.dbc"), ("--dbc and --map", "--replay")),
+        (("--load", "10", "--skip-bad"), ("--load: there is no car: leave out --skip-bad",)),
+        (("--replay", "x", "--scenario", "ccrs-20"), ("--replay: there is no car: leave out --scenario",)),
         (("--replay", "x.log"), ("--replay LOG needs --dbc FILE and --map FILE",)),
         (("--replay", "x.log", "--dbc", "x.dbc"), ("needs --dbc FILE and --map FILE",)),
     ],
@@ -239,10 +247,37 @@ def test_a_map_that_does_not_exist(refused: Output, replay: Replay) -> None:
     assert all_words(refused(*arguments, replay.map), str(replay.map), "No such file")
 
 
-@pytest.mark.parametrize("content", ["", "garbage\n", LOG.rstrip("\n"), "\0" * 500, "(1.0) can0 210#01\n"])
-def test_a_log_without_a_frame(refused: Output, replay: Replay, content: str) -> None:
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("", "the file is empty"),
+        ("garbage\n", "line 1: not a candump line: 'garbage'"),
+        (LOG.rstrip("\n"), "no frame in it, read as candump (1 times torn last line)"),
+        ("\0" * 500, "no frame in it, read as candump"),
+        (LOG + "(1.0) can0 210#01\n", "line 2: not a candump line: '(1.0) can0 210#01'"),
+        (
+            "(1.000000) can0 00000210#01\n",
+            "no frame in it that the bus carries, read as candump (1 times 29-bit",
+        ),
+    ],
+)
+def test_a_log_without_a_frame_or_with_a_bad_line(
+    refused: Output, replay: Replay, content: str, reason: str
+) -> None:
     replay.log.write_text(content)
-    assert all_words(refused(*replay.arguments()), str(replay.log), "no line is a CAN frame")
+    assert all_words(refused(*replay.arguments()), str(replay.log), reason)
+
+
+@pytest.mark.parametrize("ending", ["asc", "blf", "trc", "mf4", "csv", "LOG"])
+def test_a_log_that_is_not_of_its_format(refused: Output, replay: Replay, ending: str) -> None:
+    other = replay.log.rename(replay.log.with_suffix(f".{ending}"))
+    other.write_text("hello\n")
+    replay.log = other
+    assert str(other) in refused(*replay.arguments())
+
+
+def test_what_is_about_a_replay_needs_one(refused: Output) -> None:
+    assert "only with --replay LOG: leave out --dbc, --skip-bad" in refused("run", "--dbc", "x", "--skip-bad")
 
 
 def test_a_log_that_is_not_there(refused: Output, replay: Replay) -> None:

@@ -1,8 +1,10 @@
 """`aftbed campaign`, in the simulator: from a campaign file to reports and a gate."""
 
+import hashlib
 import json
 import re
 import shutil
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -136,13 +138,34 @@ def test_two_campaigns_are_compared(spec: Path, ran: Ran, output: Output, call: 
     ran("base")
     same = json.loads(output("campaign", "compare", "base", "base", "--json"))
     assert not same["worse"] and [c["pairs"] for c in same["changes"]] == [12, 12]
+    output("campaign", "compare", "base", "base", "--outcomes")
     records = spec.parent / "base" / "records.jsonl"
     worse = records.read_text().replace('"outcome":"tolerated"', '"outcome":"sdc"')
     (spec.parent / "new").mkdir()
     (spec.parent / "new" / "records.jsonl").write_text(worse)
     code, out, _ = call("campaign", "compare", "base", "new")
     assert code == 1
-    assert re.search(r"pbr · crash +12 pairs: 0 failed only before, 12 only now .*: worse", out), out
+    assert re.search(
+        r"12 pairs: 12 with another outcome, 0 failed only before, 12 only now .*: worse", out
+    ), out
+
+
+def test_an_outcome_that_is_another_one_or_missing_fails_a_comparison_of_outcomes(
+    spec: Path, ran: Ran, call: Call
+) -> None:
+    ran("base")
+    head, *results = (spec.parent / "base" / "records.jsonl").read_text().splitlines(keepends=True)
+    better = [line.replace('"outcome":"tolerated"', '"outcome":"masked"') for line in results[:1]]
+    for name, lines in {"better": better + results[1:], "fewer": results[1:], "same": results}.items():
+        (spec.parent / name).mkdir()
+        (spec.parent / name / "records.jsonl").write_text("".join([head, *lines]))
+    for new, code in {"better": 1, "fewer": 1, "same": 0}.items():
+        assert call("campaign", "compare", "base", new)[0] == 0, "no stratum is worse"
+        assert call("campaign", "compare", "base", new, "--outcomes")[0] == code, new
+    unknown = lines[0].replace('"outcome":"tolerated"', '"outcome":"inconclusive"')
+    (spec.parent / "better" / "records.jsonl").write_text("".join([head, unknown, *lines[1:]]))
+    assert "1 with another outcome (1 unknown)" in call("campaign", "compare", "base", "better")[1]
+    assert call("campaign", "compare", "fewer", "base", "--outcomes")[0] == 0, "more is not less"
 
 
 @pytest.mark.parametrize("name", ["out.csv", "out.parquet"])
@@ -191,3 +214,55 @@ def test_bad_input_is_refused_and_nothing_is_run(
     monkeypatch.chdir(tmp_path)
     assert message in refused("campaign", *arguments)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_bundle_is_made_and_verified(spec: Path, ran: Ran, output: Output, call: Call) -> None:
+    ran("out")
+    made = json.loads(output("campaign", "bundle", "out", "--out", "e.zip", "--json"))
+    found = json.loads(output("campaign", "verify", "e.zip", "--json"))
+    assert found == made | {"misfits": []}
+    assert output("campaign", "verify", "e.zip").endswith("\nall fit\n")
+    with zipfile.ZipFile(spec.parent / "e.zip", "a") as archive:
+        archive.writestr("late.txt", "put in later")
+    code, out, _ = call("campaign", "verify", "e.zip")
+    assert code == 1 and out.endswith("\nlate.txt: it is not in SHA256SUMS\n"), out
+
+
+def test_what_cannot_be_bundled_or_is_no_bundle_is_usage(spec: Path, ran: Ran, call: Call) -> None:
+    ran("out")
+    for arguments, why in {
+        ("bundle", "out", "--out", "e.tar"): "--out e.tar: a file .zip in a directory that exists is allowed",
+        ("bundle", "gone", "--out", "e.zip"): "is this the directory of a campaign?",
+        ("verify", "try.yaml"): "try.yaml: found no zip archive, as a bundle is, or a broken one",
+        ("verify", "gone.zip"): "gone.zip: cannot be read: No such file or directory",
+    }.items():
+        code, _, err = call("campaign", *arguments)
+        assert code == 2 and why in err, err
+    assert not (spec.parent / "e.zip").exists()
+
+
+def test_an_argument_is_made_of_a_bundle(spec: Path, ran: Ran, output: Output, call: Call) -> None:
+    ran("out")
+    output("campaign", "bundle", "out", "--out", "e.zip")
+    found = json.loads(output("campaign", "argument", "e.zip", "--plot", "a.svg", "--json"))
+    (solution,) = [node for node in found["nodes"] if node["kind"] == "solution"]
+    with zipfile.ZipFile(spec.parent / "e.zip") as archive:
+        records = archive.read(solution["entry"])
+    assert hashlib.sha256(records).hexdigest() == solution["sha256"]
+    assert (spec.parent / "a.svg").read_text().startswith("<svg")
+    assert "\nG1 supported: " in output("campaign", "argument", "e.zip")
+    assert call("campaign", "argument", "e.zip", "--plot", "a.png")[0] == 2
+    with zipfile.ZipFile(spec.parent / "e.zip", "a") as archive:
+        archive.writestr("late.txt", "put in later")
+    code, out, err = call("campaign", "argument", "e.zip", "--plot", "b.svg")
+    assert (code, out) == (1, "") and "late.txt: it is not in SHA256SUMS" in err
+    assert not (spec.parent / "b.svg").exists()
+
+
+def test_a_goal_that_failed_is_exit_code_1(spec: Path, ran: Ran, output: Output, call: Call) -> None:
+    ran("out")
+    records = spec.parent / "out" / "records.jsonl"
+    records.write_text(records.read_text().replace('"outcome":"tolerated"', '"outcome":"sdc"', 1))
+    output("campaign", "bundle", "out", "--out", "e.zip")
+    code, out, _ = call("campaign", "argument", "e.zip")
+    assert code == 1 and "\nG3 failed: " in out and "  pbr failed: try: 1 of 12 experiments broke it" in out

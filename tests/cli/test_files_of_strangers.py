@@ -18,9 +18,12 @@ from records import outcomes, whole
 from sampling import sampled
 
 from aftbed.campaign.ledger import NAME
-from aftbed.cli.campaign import HTML, JUNIT, MARKDOWN, SUMMARY
+from aftbed.campaign.ledger import read as read_ledger
 from aftbed.core.events import Event
 from aftbed.interop.openscenario import importer
+from aftbed.report.bundle import SUMS, BundledFile, archive_of, entries, sha256
+from aftbed.report.documents import HTML, JUNIT, MARKDOWN, SUMMARY
+from aftbed.runtime.unix.trust import NOBODY
 
 pytestmark = pytest.mark.simulation
 
@@ -420,3 +423,38 @@ def test_an_experiment_that_no_campaign_has_is_refused(
     folder = ledger(stranger, ran, **changes)
     for words in (("report", folder), ("replay", folder, "0"), ("compare", folder, folder)):
         assert "line 2" in stranger.read_by("campaign", *words, code=2)
+
+
+def test_a_function_of_a_stranger_is_not_put_into_a_bundle(stranger: Stranger, ran: Path) -> None:
+    folder = ledger(stranger, ran)
+    head, result = (folder / NAME).read_text().splitlines()
+    named = json.loads(head)
+    for key, value in {"app": "evil.py:Evil", "request_file": str(stranger.mine)}.items():
+        other = named | {"spec": named["spec"] | {"system": named["spec"]["system"] | {key: value}}}
+        stranger.file(f"campaign/{NAME}", f"{json.dumps(other)}\n{result}\n")
+        words = ("campaign", "bundle", folder, "--out", stranger.out / "e.zip")
+        shown = stranger.read_by(*words, code=2)
+        assert ("is not trusted, so it was not executed" in shown) == (key == "app")
+    assert not list(stranger.out.iterdir())
+
+
+def test_a_bundle_is_argued_from_without_its_words(stranger: Stranger, ran: Path) -> None:
+    """Whoever makes a bundle makes its hashes, too: what is in it is text, and all that it is."""
+    made = entries([read_ledger(ran / NAME)], NOBODY)
+    head, line = made[f"try/{NAME}"].data.decode().splitlines()
+    result = json.loads(line)
+    result |= {"outcome": "sdc", "reasons": [f"{SCRIPT}{ESCAPE}"]}
+
+    def bundle(**changes: object) -> Path:
+        result["experiment"] |= changes
+        files = made | {f"try/{NAME}": BundledFile(f"{head}\n{json.dumps(result)}\n".encode())}
+        sums = "".join(f"{sha256(file.data)}  {one}\n" for one, file in files.items() if one != SUMS)
+        return stranger.file("e.zip", archive_of(files | {SUMS: BundledFile(sums.encode())}))
+
+    file, picture = bundle(stratum=f"{SCRIPT}{ESCAPE}"), stranger.out / "a.svg"
+    stranger.read_by("campaign", "verify", file, code=0)
+    shown = stranger.read_by("campaign", "argument", file, "--plot", picture, code=1)
+    assert "G3 failed" in shown and SCRIPT in shown
+    assert "<script" not in picture.read_text()
+    assert not any(one in picture.read_text() for one in "\x1b\x9b\u202e\x07")
+    assert "unknown FTM 'evil'" in stranger.read_by("campaign", "argument", bundle(ftm="evil"), code=2)

@@ -30,6 +30,17 @@ def test_frames_that_are_left_out_are_counted(log: Path, output: Output) -> None
     )
 
 
+def test_bad_lines_are_an_error_or_are_counted(log: Path, output: Output, refused: Output) -> None:
+    log.write_text(LOG + "hello\n\x1b[2J\n")
+    assert "bus.log: line 3: not a candump line: 'hello', expected" in refused(
+        "log", "convert", log, "bus.asc"
+    )
+    said = output("log", "convert", log, "bus.asc", "--skip-bad")
+    assert said.startswith(
+        "bus.asc: 2 frames, candump to asc\n  skipped: 2 bad parts, the first at line 3: not a"
+    )
+
+
 def test_an_unknown_format_is_refused_with_those_allowed(log: Path, refused: Output) -> None:
     allowed = "(one of: asc, blf, candump, csv, mf4, trc)"
     assert refused("log", "convert", log, "bus.txt") == (

@@ -169,8 +169,8 @@ def test_a_proposal_that_is_not_whole_ends_with_1(folder: Path, call: Call) -> N
             ("check", "ars408-like", "--dbc", "esr-like"),
             "ars408-like.yaml: ego.message: unknown message 'SpeedInformation'",
         ),
-        (("check", "esr-like", "--log", "none.log"), "none.log: cannot read the log: No such file"),
-        (("check", "esr-like", "--log", "radar.dbc"), "radar.dbc: no line is a CAN frame"),
+        (("check", "esr-like", "--log", "none.log"), "none.log: cannot be read: No such file"),
+        (("check", "esr-like", "--log", "radar.dbc"), "radar.dbc: no frame in it, read as candump ("),
         (("new", "--dbc", "drive.log"), "drive.log: not a DBC that can be read: Invalid syntax at line 1"),
         (
             ("new", "--dbc", "radar.dbc", "--out", "drive.log"),

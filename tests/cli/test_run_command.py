@@ -1,8 +1,11 @@
-"""`aftbed run --adapt`: what is refused before the run starts, and what each adaptation begins from."""
+"""`aftbed run`: what is refused before the run starts, what an adaptation begins from, and its options."""
 
+import socket
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import pytest
 from fakerun import CLOSED, Output
 from liveruns import Home
@@ -14,6 +17,7 @@ from aftbed.core.messages import Goal, Scheduled
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix import run_directory
 from aftbed.runtime.unix.options import RunOptions
+from aftbed.vehicle.scenarios.scenario import Scenario
 
 
 @pytest.mark.parametrize(
@@ -74,24 +78,50 @@ def test_later_adaptations_are_checked_with_the_updated_function() -> None:
     assert len(scheduled(texts, graph, "paper", force=True)) == 2
 
 
-def test_the_adaptations_of_a_run_are_among_its_options(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def options_of(home: Home, monkeypatch: pytest.MonkeyPatch) -> Callable[..., RunOptions]:
+    """The options of the run that `aftbed run` with these arguments would launch."""
     started: list[RunOptions] = []
 
     class StartedError(Exception):
         pass
 
-    def launch(options: RunOptions, listener: object, requests: object) -> None:
+    def launch(options: RunOptions, listener: socket.socket | None, *_: object) -> None:
         started.append(options)
         run_directory.remove(Path(options.private))
+        if listener is not None:
+            listener.close()
         raise StartedError
 
-    monkeypatch.setattr(run, "launch", launch)
-    monkeypatch.setattr(
-        sys, "argv", ["aftbed", "run", "--load", "10", "--adapt", "to lfr after 1s", "--recipe", "paper"]
+    def of(*arguments: str) -> RunOptions:
+        monkeypatch.setattr(run, "launch", launch)
+        monkeypatch.setattr(sys, "argv", ["aftbed", "run", *arguments])
+        with pytest.raises(StartedError):
+            main()
+        return started[-1]
+
+    return of
+
+
+def test_the_adaptations_of_a_run_are_among_its_options(options_of: Callable[..., RunOptions]) -> None:
+    options = options_of("--load", "10", "--adapt", "to lfr after 1s", "--recipe", "paper")
+    assert options.adaptations == (Scheduled(Goal(expression="lfr", recipe="paper"), after_ms=1000.0),)
+
+
+def test_a_drive_of_another_duration_is_no_evidence_for_the_requirements_of_its_scenario(
+    options_of: Callable[..., RunOptions], tmp_path: Path
+) -> None:
+    mine = tmp_path / "mine.yaml"
+    mine.write_text(
+        "description: an empty road\nduration_s: 9\nego: {speed_kmh: 50}\n"
+        "verifies: [SG-1]\nexpect: {outcome: no_braking}\n"
     )
-    with pytest.raises(StartedError):
-        main()
-    assert started[0].adaptations == (Scheduled(Goal(expression="lfr", recipe="paper"), after_ms=1000.0),)
+    whole = options_of("--scenario", str(mine))
+    assert whole.verifies == ("SG-1",)
+    assert msgspec.msgpack.decode(whole.drive, type=Scenario).duration_ms == 9000
+    shorter = options_of("--scenario", str(mine), "--duration", "1500ms", "--verifies", "SG-2")
+    assert shorter.verifies == ("SG-2",)
+    assert msgspec.msgpack.decode(shorter.drive, type=Scenario).duration_ms == 1500
 
 
 @pytest.mark.parametrize(

@@ -8,14 +8,23 @@ from typing import Final
 
 import msgspec
 import pytest
+from buslog import read_log
 from hypothesis import HealthCheck, assume, given, settings
 from loggedframes import LOGS, NOW_US
 from sampling import sampled
 
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.interop import logs
-from aftbed.interop.logs import READERS, WRITERS, CanLog, FrameKind, LoggedFrame, channels_of, convert
-from aftbed.vehicle.can.candump import read_log
+from aftbed.interop.logs import (
+    READERS,
+    WRITERS,
+    CanLog,
+    FdFlags,
+    FrameKind,
+    LoggedFrame,
+    channels_of,
+    convert,
+)
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.python_can import with_asammdf
 
@@ -29,6 +38,7 @@ DATES_US: Final = (0, 5_123_456, NOW_US + 5_001)
 # than half a microsecond in all; later, if the log spans decades, by more.
 BLF_EXACT_US_MAX: Final = 2**31 * 1_000_000 - 1
 Frames = tuple[LoggedFrame, ...]
+EIGHT: Final = LoggedFrame(1_000_002, "can0", 0x130, bytes.fromhex("0102030405060708"))
 
 
 def without_direction(frames: Frames) -> Frames:
@@ -144,10 +154,21 @@ def test_interfaces_keep_their_numbers_and_names_get_free_ones() -> None:
             b"(1.000002) can0 20000004#0010000000000000",
             LoggedFrame(1_000_002, "can0", 4, bytes.fromhex("0010000000000000"), True, FrameKind.ERROR),
         ),
-        (b"(1.000002) can0 130##1AABB", None),
+        (b"(1.000002) can0 130##1AABB", LoggedFrame(1_000_002, "can0", 0x130, b"\xaa\xbb", fd=FdFlags(True))),
+        (b"(1.000002) can0 130##2", LoggedFrame(1_000_002, "can0", 0x130, fd=FdFlags(False, True))),
+        (
+            b"(1.000002) can0 130##4" + b"00" * 64,
+            LoggedFrame(1_000_002, "can0", 0x130, bytes(64), fd=FdFlags()),
+        ),
+        (b"(1.000002) can0 130#0102030405060708_9", EIGHT),
+        (b"(1.000002) can0 130#0102030405060708_F R", EIGHT),
+        (
+            b"(1.000002) can0 130#R8_A",
+            LoggedFrame(1_000_002, "can0", 0x130, kind=FrameKind.REMOTE, length=8),
+        ),
     ],
 )
-def test_a_candump_line_is_parsed_as_by_can_utils(line: bytes, found: LoggedFrame | None) -> None:
+def test_a_candump_line_is_parsed_as_by_can_utils(line: bytes, found: LoggedFrame) -> None:
     assert logs.parse_candump(line) == found
 
 
@@ -157,7 +178,12 @@ def test_a_candump_line_is_parsed_as_by_can_utils(line: bytes, found: LoggedFram
         (b"", "not a candump line: '', expected"),
         (b"hello", "not a candump line: 'hello', expected"),
         (b"(1.000002) can0 130#010", "not a candump line"),
-        (b"(1.000002) can0 130#0102030405060708_9", "not a candump line"),
+        (b"(1.000002) can0 130#0102030405060708_8", "not a candump line"),
+        (b"(1.000002) can0 130#01020304050607_9", "not a candump line"),
+        (b"(1.000002) can0 130#R7_9", "not a candump line"),
+        (b"(1.000002) can0 130##", "not a candump line"),
+        (b"(1.000002) can0 130##0" + b"00" * 9, "a CAN FD frame of 9 bytes, allowed are 0 to 8, 12, 16"),
+        (b"(1.000002) can0 20000004##0", "error frame: it cannot be a CAN FD frame"),
         (b"(1.000002) can0 900#01", "CAN id 0x900, allowed is 0 to 0x7ff"),
         (b"(1.000002) can0 40000000#01", "CAN id 0x40000000, allowed is 0 to 0x1fffffff"),
         (b"(1.000002) can0 130#010203040506070809", "9 bytes, allowed are 0 to 8"),
@@ -208,9 +234,9 @@ def test_frames_left_out_are_counted(tmp_path: Path) -> None:
     log = tmp_path / "all.log"
     log.write_text(
         "(1.000000) can0 130#01\n(1.000001) can0 130#R2\n(1.000002) can0 20000080#\n"
-        "(1.000003) can0 130##001\n(1.000004) can0 131#02\n(1.000005) can0 13"
+        "(1.000004) can0 131#02\n(1.000005) can0 13"
     )
-    kept = {"CAN FD frame": 1, "torn last line": 1}
+    kept = {"torn last line": 1}
     assert convert(log, tmp_path / "all.blf").left_out == kept
     done = convert(log, tmp_path / "all.trc")
     assert done.frames == 2

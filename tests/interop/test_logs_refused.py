@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 
 from aftbed.core.errors import ConfigError
 from aftbed.interop import logs
-from aftbed.interop.logs import READERS, WRITERS, CanLog, LoggedFrame, convert
+from aftbed.interop.logs import READERS, SKIP_BAD, WRITERS, CanLog, LoggedFrame, convert
+from aftbed.vehicle.can.python_can import can
 
 FRAMES: Final = tuple(LoggedFrame(1000 * n, "can0", 0x100 + n % 64, bytes(8)) for n in range(200))
 WITH_FILES: Final = (HealthCheck.function_scoped_fixture, HealthCheck.too_slow)
@@ -48,7 +49,6 @@ TRC_HEAD: Final = ";$FILEVERSION=2.1\n;$STARTTIME=25569.0\n;$COLUMNS=N,O,T,B,I,d
     [
         ("a.log", "", "a.log: the file is empty"),
         ("a.log", "(1.000000) can0 130#01\nhello\n", "a.log: line 2: not a candump line: 'hello', expected"),
-        ("a.log", "(1.000000) can0 130##001\n", "no frame in it, read as candump (1 times CAN FD frame)"),
         ("a.log", "(1.000000) can0 130#01", "no frame in it, read as candump (1 times torn last line)"),
         ("a.asc", "hello\n", "a.asc: no frame in it, read as asc"),
         ("a.asc", ASC_HEAD + " 0.1 1  123  Rx  d 8 01 02\n", "a.asc: line 4: a frame of 8 bytes with 2"),
@@ -85,12 +85,7 @@ def test_a_malformed_log_is_refused_with_file_and_position(
             {},
             "a: a name without an ending says no format; --from does (one of: asc, blf, candu",
         ),
-        (
-            "a.csv",
-            "b.asc",
-            {},
-            "a.csv: the ending '.csv' says no format; --from does (one of: asc, blf, cand",
-        ),
+        ("a.csv", "b.asc", {}, "a.csv: cannot be read: No such file or directory"),
         (
             "a.log",
             "b",
@@ -103,7 +98,7 @@ def test_a_malformed_log_is_refused_with_file_and_position(
             {"to_format": "acs"},
             "unknown format of --to 'acs'; did you mean 'csv'? (one of",
         ),
-        ("a.log", "b.asc", {"from_format": "csv"}, "unknown format of --from 'csv'"),
+        ("a.log", "b.asc", {"from_format": "xls"}, "unknown format of --from 'xls'"),
         (
             "a.log",
             "b.asc",
@@ -242,19 +237,36 @@ def test_any_bytes_of_an_mf4_give_frames_or_one_error(data: st.DataObject, tmp_p
     answers_any_bytes("mf4", data, tmp_path)
 
 
+def by_frame(log: CanLog, path: Path) -> None:
+    """As CSV of python-can."""
+    with can.CSVWriter(path) as writer:
+        for frame in log.frames:
+            writer(can.Message(frame.t_us / 1e6, frame.can_id, False, data=frame.data))
+
+
 def answers_any_bytes(name: str, data: st.DataObject, tmp_path: Path) -> None:
     whole = tmp_path / f"whole.{name}"
     if not whole.exists():
-        WRITERS[name](MF4, whole)
+        {**WRITERS, "csv": by_frame}[name](MF4, whole)
     content = bytearray(whole.read_bytes())
     for _ in range(data.draw(st.integers(0, 4))):
         content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
     cut = data.draw(st.integers(0, len(content)))
     path = made(tmp_path / "changed", bytes(content[:cut]) + data.draw(st.binary(max_size=20)))
+    read = refused = None
     try:
-        READERS[name](path)
+        read = READERS[name](path)
     except ConfigError as error:
-        assert str(error).startswith(f"{path}: ")
+        refused = str(error)
+        assert refused.startswith(f"{path}: ")
+    try:
+        skipping = READERS[name](path, skip_bad=True)
+    except ConfigError as error:
+        assert read is None and SKIP_BAD not in str(error)
+    else:
+        assert read == skipping if refused is None else skipping.skipped > 0
+        if refused is not None:
+            assert refused == f"{path}: {skipping.first_skipped}; {SKIP_BAD} leaves out such parts"
 
 
 def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,7 +28,7 @@ from aftbed.runtime.unix.closed_loop import (
     Proposed,
     RuleReport,
 )
-from aftbed.runtime.unix.options import LoadRun, PolicyOptions, ReplayRun
+from aftbed.runtime.unix.options import CarRun, LoadRun, PolicyOptions, ReplayRun
 from aftbed.runtime.unix.request_store import EXPECTED_NAME, REQUESTS_NAME
 from aftbed.runtime.unix.run_directory import HISTORY_NAME
 from aftbed.vehicle.aeb.function import default_application, sample_requests
@@ -68,8 +68,8 @@ def shorter(path: Path) -> Verdict:
     return record.verdict()
 
 
-def driven(path: Path, end: str | None, t_us: int) -> Verdict:
-    record = whole(path, CAR)
+def driven(path: Path, end: str | None, t_us: int, car: CarRun = CAR) -> Verdict:
+    record = whole(path, car)
     assert record.end is not None
     record.end["result"] = {"end": end, "t_us": t_us, "result": msgspec.to_builtins(STOPPED)}
     return record.verdict()
@@ -228,6 +228,13 @@ def test_what_did_not_happen_is_no_pass(path: Path, row: Asked) -> None:
 @pytest.mark.parametrize("end", ["collision", "standstill", "duration"])
 def test_a_drive_that_came_to_its_end_is_complete(path: Path, end: str) -> None:
     assert driven(path, end, 9_000_000).checks["complete"] == "pass"
+
+
+def test_a_drive_of_a_duration_has_to_last_that_long(path: Path) -> None:
+    asked = replace(CAR, duration_ms=1_500)
+    assert driven(path / "whole", "duration", 1_500_000, asked).checks["complete"] == "pass"
+    verdict = driven(path / "short", "duration", 1_499_000, asked)
+    assert "complete: the drive ended after 1.499 of 1.5 s" in verdict.reasons
 
 
 def test_a_drive_that_its_user_stopped_is_judged_by_what_it_did(path: Path) -> None:

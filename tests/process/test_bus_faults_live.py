@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Final
 
 import pytest
+from buslog import read_log
 from liveruns import SHORT, Command, Home, Started, aftbed
 
 from aftbed.campaign.states import RunState, states_of
@@ -13,7 +14,6 @@ from aftbed.inject.receipts import BusTimes, ReceiptState
 from aftbed.judge.intervals import Reaction
 from aftbed.judge.record import read_record
 from aftbed.runtime.unix.options import CarRun
-from aftbed.vehicle.can.candump import read_log
 
 pytestmark = pytest.mark.process
 

@@ -13,6 +13,7 @@ from liveruns import GONE_SECONDS_MAX, Home, aftbed, until
 
 from aftbed.campaign import ledger
 from aftbed.core.errors import ConfigError
+from aftbed.runtime.unix import seal
 
 pytestmark = pytest.mark.process
 
@@ -43,6 +44,15 @@ faults:
 stop: {experiments: 1}
 not_activated_max: 1.0
 unknown_max: 1.0
+"""
+WRONG = """\
+campaign: wrong
+system: {requests: 30}
+mechanisms: [pbr]
+faults:
+- {name: flip, fault: bitflip result bit 60 at server.exit nth 9, expect: {"*": [tolerated]}}
+- {name: expected, fault: bitflip result bit 60 at server.exit nth 9, expect: {"*": [sdc]}}
+stop: {experiments: 1}
 """
 EXPERIMENTS = 12
 SMOKE_SECONDS_MAX = 600.0  # of all its experiments
@@ -117,6 +127,19 @@ def test_a_run_that_hangs_as_expected_breaks_nothing(home: Home, tmp_path: Path)
     (result,) = ledger.read(tmp_path / "out" / ledger.NAME).results
     assert (result.broken, result.unexpected) == ((), False)
     assert result.outcome == "hang" or result.noisy, result.reasons
+
+
+def test_the_record_of_a_run_that_went_otherwise_than_expected_is_kept(home: Home, tmp_path: Path) -> None:
+    (tmp_path / "wrong.yaml").write_text(WRONG)
+    done = aftbed("campaign", "run", tmp_path / "wrong.yaml", "--out", tmp_path / "out", "--json")
+    assert done.code == 1, done.out + done.err
+    flip, expected = ledger.read(tmp_path / "out" / ledger.NAME).results
+    assert flip.unexpected and not expected.unexpected
+    (record,) = (tmp_path / "out" / ledger.RECORDS).iterdir()
+    assert record.name == flip.experiment.id and seal.sealed(record)
+    judged = aftbed("check", record)
+    assert judged.code == 1 and "value: request 9: sdc" in judged.out, judged.out + judged.err
+    assert not home.left()
 
 
 @pytest.mark.timeout(SMOKE_SECONDS_MAX + 60)

@@ -11,10 +11,11 @@ from typing import Final
 
 import pytest
 from busharness import DEADLINE_S, RawClient
-from liveruns import Home, Started
+from liveruns import Home, Started, until
 
 from aftbed.runtime.unix.options import CarRun
 from aftbed.runtime.unix.run_directory import members
+from aftbed.vehicle.can.hub import BEACON
 
 pytestmark = pytest.mark.process
 
@@ -84,3 +85,42 @@ def test_on_a_bus_that_was_opened_a_listener_and_a_sender_change_no_verdict(home
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
     (found,) = outcome.verdict.strangers
     assert (found.connections, found.frames) == (1, 1)
+
+
+@contextmanager
+def beacons() -> Iterator[socket.socket]:
+    """Where beacons arrive. Only one program of a machine can listen there, so it may take some seconds."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear:
+
+        def bound() -> bool:
+            with suppress(OSError):
+                ear.bind(BEACON)
+                return True
+            return False
+
+        until(bound, "no other program listens for beacons")
+        yield ear
+
+
+def test_a_stranger_finds_the_run_and_cannot_be_its_car(home: Home) -> None:
+    """And it is told when the run ends. Other runs on this machine have beacons, too."""
+    with beacons() as ear, Started(home, CarRun("free-drive", 1.0, "latch", 60_000)) as run:
+        port = run.launched.options.port
+        ear.settimeout(DEADLINE_S)
+        while f"<URL>can://127.0.0.1:{port}</URL>".encode() not in (beacon := ear.recv(1024)):
+            pass
+        assert f'<CANBeacon name="aftbed run {run.private.name}"'.encode() in beacon
+        run.wait_for("started")
+        with RawClient(port) as stranger:
+            stranger.write("< aftbed plant >")
+            while "only the nodes of the run may do this" not in stranger.read():
+                pass
+            run.launched.stop()
+            outcome = run.finish()
+            last = element = stranger.read()
+            while element:
+                last, element = element, stranger.read()
+    assert last.endswith("the run has ended >")
+    assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
+    (found,) = outcome.verdict.strangers
+    assert (found.connections, found.refused, found.commands_refused, found.frames) == (1, 1, 1, 0)

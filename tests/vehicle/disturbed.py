@@ -7,6 +7,7 @@ from pathlib import Path
 
 import msgspec
 from busharness import FunctionGateway, RunningHub, running_hub
+from buslog import read_log
 from puredrive import CODEC
 
 from aftbed.inject.bus import BusFault, read_bus_fault
@@ -15,7 +16,6 @@ from aftbed.inject.model import parse
 from aftbed.inject.radar import RadarFault, RadarFaults
 from aftbed.inject.receipts import BusReport, RadarReport
 from aftbed.vehicle.aeb.function import default_application
-from aftbed.vehicle.can.candump import read_log
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.hub import HubOptions
 from aftbed.vehicle.drive_real import CarBuses, DriveOptions, DriveReport, drive

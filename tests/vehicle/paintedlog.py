@@ -8,10 +8,11 @@ are as good as any.
 from collections.abc import Iterator
 
 import cantools
+from buslog import read_log
 from cantools.database import Database
 from puredrive import TOYOTA_DBC, TOYOTA_LOG
 
-from aftbed.vehicle.can.candump import LogFrame, read_log
+from aftbed.vehicle.can.candump import LogFrame
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.replay.mapped_gateway import toyota_checksum
 

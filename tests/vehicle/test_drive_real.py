@@ -9,10 +9,10 @@ from pathlib import Path
 import msgspec
 import pytest
 from busharness import TestGateway, brake_late, running_hub
+from buslog import read_log
 
 from aftbed.core.errors import HarnessError
 from aftbed.vehicle.can import bus as bus_module
-from aftbed.vehicle.can.candump import read_log
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.hub import HubOptions
 from aftbed.vehicle.drive_real import CarBuses, DriveOptions, DriveReport, drive

@@ -42,8 +42,10 @@ def serve(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> N
             _serve_hub(line, order, fds)
             return
         source = msgspec.msgpack.decode(order.options, type=SourceOptions)
-        run = _play if order.service == PLAYER else _drive
-        run(line, source)
+        if order.service == PLAYER:
+            _play(line, source, fds[0])
+        else:
+            _drive(line, source)
     except (HarnessError, OSError) as error:
         _report(line, "trouble", str(error).encode())
 
@@ -64,10 +66,10 @@ class _SupervisorLink:
         self._reported: dict[int, ReceiptState] = {}  # by the number of the fault
 
     def attend(self, hub: Hub) -> bool:
-        """Carry out the next order; False when the line has ended."""
+        """Carry out the next order; False when it is a Stop, or the line has ended."""
         got = self._line.recv()
         match got[0] if got is not None else None:
-            case None:
+            case None | control.Stop():
                 return False
             case control.DisturbBus(number, fault, draw):
                 from aftbed.inject.bus_disturber import Disturber  # noqa: PLC0415 - few runs need it
@@ -209,28 +211,31 @@ def _drive(line: Line[control.ToNode], source: SourceOptions) -> None:
         _report(line, "result", msgspec.json.encode(result))
 
 
-def _play(line: Line[control.ToNode], source: SourceOptions) -> None:
+def _play(line: Line[control.ToNode], source: SourceOptions, log: int) -> None:
     from aftbed.vehicle.can.bus import BusOptions, open_bus  # noqa: PLC0415
-    from aftbed.vehicle.can.candump import read_log  # noqa: PLC0415
     from aftbed.vehicle.can.dbc_file import own_dbc  # noqa: PLC0415
     from aftbed.vehicle.replay.map_file import bind, find_map  # noqa: PLC0415
     from aftbed.vehicle.replay.mapped_gateway import MappedGateway  # noqa: PLC0415
-    from aftbed.vehicle.replay.player import play  # noqa: PLC0415
+    from aftbed.vehicle.replay.player import PlayedLog, play  # noqa: PLC0415
 
     work = source.work
     assert isinstance(work, ReplayRun), work
-    gateway = MappedGateway(own_dbc(), bind(find_map(work.map), Path(work.dbc)))
-    frames, counts = read_log(Path(work.log))
+    bound = bind(find_map(work.map), Path(work.dbc))
+    gateway = MappedGateway(own_dbc(), bound)
+    with open(log, "rb") as file:
+        played = msgspec.msgpack.decode(file.read(), type=PlayedLog)
     bus = open_bus(BusOptions(port=source.port, secret=source.secret, node=PLAYER))
     orders = _Orders(line)
     if orders.until_go():
         result = play(
-            frames,
+            played.frames,
             own_dbc(),
             bus,
             work.pace,
             ends_cycle=lambda frame: gateway.on_frame(frame) is not None,
             stop=orders.stop,
+            pause_us=bound.map.cycle_ms * 1000 if work.loop else None,
+            until_us=work.duration_ms * 1000 if work.duration_ms is not None else None,
         )
-        report = {"played": result, "log": counts, "gateway": gateway.counts}
+        report = {"played": result, "log": played.report, "gateway": gateway.counts}
         _report(line, "result", msgspec.json.encode(report))

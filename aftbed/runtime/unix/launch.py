@@ -12,13 +12,13 @@ command keeps them, of this run or of a later one: else one run would end only a
 import contextlib
 import os
 import resource
-import select
 import shutil
 import signal
 import socket
 import time
 import weakref
 from collections.abc import Iterator
+from io import FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NoReturn
 
@@ -38,6 +38,7 @@ from aftbed.runtime.unix.process_pool import killed_by
 from aftbed.runtime.unix.request_store import write_given
 from aftbed.runtime.unix.supervisor_process import GO, RUN, be_supervisor
 from aftbed.runtime.unix.transport import Line, decode_report
+from aftbed.vehicle.can.bus_model import HOST
 
 if TYPE_CHECKING:
     from aftbed.functions.request_file import GivenRequests
@@ -76,7 +77,7 @@ def bind_hub(port: int) -> socket.socket:
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        sock.bind(("127.0.0.1", port))
+        sock.bind((HOST, port))
         sock.listen(BACKLOG)
     except OSError as error:
         sock.close()
@@ -106,7 +107,11 @@ class Launched:
     """
 
     def __init__(
-        self, options: RunOptions, listener: socket.socket | None, given: "GivenRequests | None" = None
+        self,
+        options: RunOptions,
+        listener: socket.socket | None,
+        given: "GivenRequests | None" = None,
+        log: bytes | None = None,
     ) -> None:
         self.options = options
         self.private, self.record = Path(options.private), Path(options.record)
@@ -119,7 +124,7 @@ class Launched:
         start = head_start.taken() or _fork_supervisor(listener)
         self.supervisor, self.line = start.pid, Line(start.line, decode_report)
         try:
-            self._fork_warden(listener)
+            self._fork_warden(listener, log)
         except OSError:
             start.end()
             raise
@@ -127,13 +132,13 @@ class Launched:
 
     # -- start --------------------------------------------------------------------------------
 
-    def _fork_warden(self, listener: socket.socket | None) -> None:
+    def _fork_warden(self, listener: socket.socket | None, log: bytes | None) -> None:
         """Tell the supervisor what to run, and fork the warden. Each has its ends of two pipes."""
         command_end, command_life = os.pipe()
         supervisor_end, supervisor_life = os.pipe()
         waker = os.eventfd(0)
         self._pidfd = os.pidfd_open(self.supervisor)
-        self._hand_over(supervisor_life, waker, *([listener.fileno()] if listener is not None else []))
+        self._hand_over((supervisor_life, waker), listener, log)
         os.close(supervisor_life)
         self.warden = os.fork()
         if self.warden == 0:
@@ -162,18 +167,22 @@ class Launched:
         self._reference = weakref.ref(self, _LAUNCHED.discard)
         _LAUNCHED.add(self._reference)
 
-    def _hand_over(self, *fds: int) -> None:
+    def _hand_over(self, fds: tuple[int, int], listener: socket.socket | None, log: bytes | None) -> None:
         """Send the options to the supervisor, as a file, and descriptors. Raises OSError."""
-        with open(os.memfd_create("aftbed-options"), "wb", buffering=0) as file:
-            left = memoryview(_encode(self.options))
-            while left:
-                left = left[file.write(left) :]
-            socket.send_fds(self.line.sock, [RUN], [file.fileno(), *fds])
+        with contextlib.ExitStack() as files:
+            of_options = files.enter_context(_memfd("options", _encode(self.options)))
+            found = [of_options.fileno(), *fds]
+            if listener is not None:
+                found.append(listener.fileno())
+            if log is not None:
+                assert listener is not None, "a log without a bus"
+                found.append(files.enter_context(_memfd("log", log)).fileno())
+            socket.send_fds(self.line.sock, [RUN], found)
 
     def _make_directories(self, given: "GivenRequests | None") -> None:
         """Make the private directory and the record, with what was asked for in it, and send *go*."""
         about = {"version": __version__, "started_ns": self.started_ns, **msgspec.to_builtins(self.options)}
-        for key in ("listener", "private", "drive"):
+        for key in ("listener", "log", "private", "drive"):
             about.pop(key)
         about["load"] = isinstance(self.options.work, LoadRun)
         about["kept"] = self._kept
@@ -226,9 +235,9 @@ class Launched:
             return
         self._waited = True
         self.line.close()
-        if not _ends(self._pidfd, END_SECONDS_MAX):
+        if not linux.ends(self._pidfd, END_SECONDS_MAX):
             linux.kill(self._pidfd, signal.SIGKILL)
-            _ends(self._pidfd, KILL_SECONDS_MAX)
+            linux.ends(self._pidfd, KILL_SECONDS_MAX)
         code = os.waitstatus_to_exitcode(os.waitpid(self.supervisor, 0)[1])
         if code < 0 and not self.trouble:
             self.trouble = f"the supervisor {killed_by(-code, self.record)}"
@@ -248,7 +257,7 @@ class Launched:
         life, self._life = self._life, []
         for fd in life:
             os.close(fd)
-        if not _ends(self._warden_pidfd, KILL_SECONDS_MAX):
+        if not linux.ends(self._warden_pidfd, KILL_SECONDS_MAX):
             linux.kill(self._warden_pidfd, signal.SIGKILL)  # a stopped warden would never end
         os.waitpid(self.warden, 0)
         _LAUNCHED.discard(self._reference)
@@ -277,21 +286,28 @@ def _disown_all() -> None:
 os.register_at_fork(after_in_child=_disown_all)
 
 
-def _ends(pidfd: int, seconds: float) -> bool:
-    poll = select.poll()
-    poll.register(pidfd, select.POLLIN)
-    return bool(poll.poll(seconds * 1e3))
+def _memfd(name: str, content: bytes) -> FileIO:
+    """A file in memory, to be read from its beginning. Raises OSError."""
+    file = FileIO(os.memfd_create(f"aftbed-{name}"), "r+")
+    left = memoryview(content)
+    while left:
+        left = left[file.write(left) :]
+    file.seek(0)
+    return file
 
 
 def launch(
-    options: RunOptions, listener: socket.socket | None, given: "GivenRequests | None" = None
+    options: RunOptions,
+    listener: socket.socket | None,
+    given: "GivenRequests | None" = None,
+    log: bytes | None = None,
 ) -> Launched:
-    """Start a run, of the requests `given` where its work names some; see `Launched`.
+    """Start a run, of the requests `given` or the PlayedLog `log` where its work is one; see `Launched`.
 
     Raises ConfigError, leaving nothing, where it cannot be started.
     """
     try:
-        return Launched(options, listener, given)
+        return Launched(options, listener, given, log)
     except BaseException as error:
         record = Path(options.record)
         if record.parent != Path(options.private):
@@ -328,7 +344,7 @@ def options_for(
     `evidence`: the options say which code this is, also of a run that verifies nothing and is not kept.
     """
     faults = tuple(with_names_resolved(fault, work) for fault in faults)
-    drive = _scenario(work.scenario) if isinstance(work, CarRun) else None
+    drive = _scenario(work) if isinstance(work, CarRun) else None
     verifies = tuple(dict.fromkeys((*verifies, *(drive.verifies if drive is not None else ()))))
     ensure_limits()
     listener = None if isinstance(work, LoadRun) else bind_hub(bus_port)
@@ -364,8 +380,11 @@ def options_for(
     return options, listener
 
 
-def _scenario(name: str) -> "Scenario":
-    """Raises ConfigError."""
+def _scenario(work: CarRun) -> "Scenario":
+    """That of `work`, as it is driven. With another duration it verifies nothing. Raises ConfigError."""
     from aftbed.vehicle.scenarios.library import load_scenario  # noqa: PLC0415 - only for a drive: PyYAML
 
-    return load_scenario(name)
+    scenario = load_scenario(work.scenario)
+    if work.duration_ms is None:
+        return scenario
+    return msgspec.structs.replace(scenario, duration_ms=work.duration_ms, verifies=())

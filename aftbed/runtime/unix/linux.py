@@ -8,6 +8,7 @@ import contextlib
 import ctypes
 import os
 import resource
+import select
 import signal
 import site
 import socket
@@ -236,6 +237,13 @@ def waited_ns(pid: int) -> int:
         return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1])
     except (OSError, ValueError, IndexError):
         return 0
+
+
+def ends(pidfd: int, seconds: float) -> bool:
+    """Whether that process ends within `seconds`."""
+    poll = select.poll()
+    poll.register(pidfd, select.POLLIN)
+    return bool(poll.poll(seconds * 1e3))
 
 
 def reap(pid: int) -> int | None:

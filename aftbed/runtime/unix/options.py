@@ -35,20 +35,26 @@ class LoadRun(msgspec.Struct, frozen=True, tag=True):
 
 
 class CarRun(msgspec.Struct, frozen=True, tag=True):
-    """A drive; `pace` None is lockstep."""
+    """A drive; `pace` None is lockstep. `duration_ms`: how long it may last, else as its scenario says."""
 
     scenario: str
     pace: float | None
     brake_policy: str
+    duration_ms: int | None = None
 
 
 class ReplayRun(msgspec.Struct, frozen=True, tag=True):
-    """A candump log through the bus."""
+    """A log through the bus: the file `log`. Its frames come with the run, since the command has read it.
+
+    `loop`: behind its end it begins again. It ends after `duration_ms` at the latest, of bus time.
+    """
 
     log: str
     dbc: str
     map: str
     pace: float | None
+    loop: bool = False
+    duration_ms: int | None = None
 
 
 Work = LoadRun | CarRun | ReplayRun
@@ -63,7 +69,8 @@ class PolicyOptions(msgspec.Struct, frozen=True):
 
 
 class RunOptions(msgspec.Struct, frozen=True):
-    """`private` and `record` are directories, made by the launch; `listener` is the hub's bound socket.
+    """`private` and `record` are directories, made by the launch; `listener` is the hub's bound socket, and
+    `log` a memfd with the `PlayedLog` of a ReplayRun.
 
     `bus_open`: other users may attach to the bus, and the verdict stands whatever strangers send.
     `application`: the protected function that the run begins with, "" for the built-in one. `drive`: the
@@ -85,6 +92,7 @@ class RunOptions(msgspec.Struct, frozen=True):
     policy: PolicyOptions | None = None
     pin: bool = True
     listener: int = -1
+    log: int = -1
     port: int = 0
     bus_open: bool = False
     application: str = ""

@@ -9,13 +9,16 @@ A record without a seal is that of a run whose command did not live to write it.
 """
 
 import hashlib
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
 import msgspec
 
 from aftbed.core.input_file import open_input, read_input
+from aftbed.runtime.unix.journal_files import trim
 
 NAME: Final = "seal.json"
 SEAL_BYTES_MAX: Final = 4_000_000
@@ -37,6 +40,17 @@ def write(record: Path) -> None:
         if path.is_file() and path.name != NAME
     }
     (record / NAME).write_bytes(msgspec.json.format(msgspec.json.encode(Seal(files, chain(files)))))
+
+
+def copy_sealed(record: Path, target: Path) -> None:
+    """Make `target`, a sealed copy of the record of a run that has ended, whole or not. Raises OSError."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
+        beside = Path(folder) / target.name
+        shutil.copytree(record, beside, symlinks=True)
+        trim(beside / "journal")
+        write(beside)
+        beside.rename(target)
 
 
 def chain(files: dict[str, str]) -> str:

@@ -5,6 +5,7 @@ on the request path: while it sleeps, requests flow. Nothing outlives it: its de
 (`PR_SET_PDEATHSIG`), and the end of the control line to its command ends the run.
 """
 
+import contextlib
 import json
 import os
 import socket
@@ -16,7 +17,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.errors import AftbedError
+from aftbed.core.errors import AftbedError, StepFailed
 from aftbed.core.graph import Link
 from aftbed.core.journal import Record
 from aftbed.ftm.compose import build
@@ -47,6 +48,7 @@ DRAIN_SECONDS_MAX: Final = 2.0
 DRAIN_SECONDS: Final = 0.005  # between two checks of what is still under way
 LOOKS_MAX: Final = 80  # at states that differ: time for a follower on a busy machine
 STOP_SECONDS_MAX: Final = 1.0
+HUB_SECONDS_MAX: Final = 0.2  # for its last frames, and to tell its clients
 
 
 class UnixRuntime:
@@ -347,6 +349,12 @@ class Supervisor:
         new.rename(self._record / "end.json")  # complete, or not there
         self._report_owner("finished", json.dumps(end).encode())
 
+    def _let_end(self, hub: UnixProcess) -> None:
+        """Give the hub time to tell its clients that the run has ended."""
+        with contextlib.suppress(StepFailed, OSError):
+            self.pool.order(hub, control.Stop(control.UNANSWERED))
+            linux.ends(hub.pidfd, HUB_SECONDS_MAX)
+
     def _kill_all(self) -> list[str]:
         """Kill all processes and reap them; what is left after a second in which they had a CPU to die on.
 
@@ -358,6 +366,8 @@ class Supervisor:
         for one in starvation.values():
             one.starves(began_ns)  # counts from here
         for process in sorted(dying, key=UnixProcess.killed_in_turn):
+            if process is self._work.bus.hub and process.alive:
+                self._let_end(process)
             process.kill()
         while dying:
             before = len(dying)

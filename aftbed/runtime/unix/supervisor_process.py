@@ -34,9 +34,9 @@ from aftbed.runtime.unix.process_pool import Started, start_zygote
 from aftbed.runtime.unix.transport import Line, decode_order, decode_report, read_file
 
 RUN: Final = (
-    b"run"  # comes with a file of options, the supervisor's life, the warden's waker, the hub's socket
+    b"run"  # comes with a file of options, the supervisor's life, the warden's waker, the hub's socket, a log
 )
-RUN_FDS_MAX: Final = 4
+RUN_FDS_MAX: Final = 5
 GO: Final = b"go"
 _decode: Final = msgspec.msgpack.Decoder(RunOptions).decode
 
@@ -96,18 +96,19 @@ def be_supervisor(owner: socket.socket, zygotes: dict[str, Started]) -> NoReturn
             os._exit(code)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         options, _life, waker = _decode(read_file(fds[0])), *fds[1:3]  # the life is kept open, no more
-        options = msgspec.structs.replace(options, listener=fds[3] if fds[3:] else -1)
+        listener, log, *_ = *fds[3:], -1, -1
+        options = msgspec.structs.replace(options, listener=listener, log=log)
         if owner.recv(len(GO)) != GO:
             _end(zygotes)
             os._exit(code)
         private, record = Path(options.private), Path(options.record)
         run_directory.mark(private)
         os.environ[run_directory.VARIABLE] = str(private)  # of all that is executed from here on
-        log = os.open(record / "processes.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
-        os.dup2(log, 1)
-        os.dup2(log, 2)
+        output = os.open(record / "processes.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+        os.dup2(output, 1)
+        os.dup2(output, 2)
         linux.set_name("aftbed-supervis")
-        zygotes = _joined(zygotes, options, log)
+        zygotes = _joined(zygotes, options, output)
         from aftbed.runtime.unix.supervisor import supervise  # noqa: PLC0415 - behind the first zygote
 
         supervise(options, owner, zygotes, UndoLedger(private, waker))
@@ -125,14 +126,14 @@ def be_supervisor(owner: socket.socket, zygotes: dict[str, Started]) -> NoReturn
         os._exit(code)
 
 
-def _joined(zygotes: dict[str, Started], options: RunOptions, log: int) -> dict[str, Started]:
+def _joined(zygotes: dict[str, Started], options: RunOptions, output: int) -> dict[str, Started]:
     """The zygotes of the run, as far as they have been started; one that it does not need is ended."""
     load = isinstance(options.work, LoadRun)
     names = (LIGHT,) if load else (LIGHT, BUS)
     assert set(zygotes) <= set(names), "a zygote without a use"
     for _, sock in zygotes.values():
         with contextlib.suppress(BrokenPipeError):  # it is dead, which the supervisor will see
-            Line(sock, decode_report).send(control.JoinRun(control.UNANSWERED, options.private), (log,))
+            Line(sock, decode_report).send(control.JoinRun(control.UNANSWERED, options.private), (output,))
     if zygotes:
         return zygotes
     cpus = sorted(os.sched_getaffinity(0))

@@ -203,6 +203,7 @@ class Workload:
         hub = {
             "secret": self._secret,
             "open_to_all": options.bus_open,
+            "beacon": f"aftbed run {options.run}",
             "lockstep": work.pace is None,
             "pace": work.pace or 1.0,
             "origin_ns": time.monotonic_ns(),
@@ -220,7 +221,10 @@ class Workload:
             source = SourceOptions(
                 options.work, options.seed, options.port, self._secret, drive=options.drive
             )
-            yield from self._assign(BUS, self._source, msgspec.msgpack.encode(source), ())
+            fds = (options.log,) if options.log >= 0 else ()
+            yield from self._assign(BUS, self._source, msgspec.msgpack.encode(source), fds)
+            for fd in fds:
+                os.close(fd)
             self.bus.vehicle = self._services.get(VEHICLE)
 
     def start(self) -> Keys:

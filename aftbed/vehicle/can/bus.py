@@ -34,12 +34,11 @@ from typing import Final, cast
 import msgspec
 
 from aftbed.core.errors import ConfigError, HarnessError
-from aftbed.vehicle.can.bus_model import Notice
+from aftbed.vehicle.can.bus_model import CHANNEL, HOST, Notice
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.python_can import can
 from aftbed.vehicle.condition import Condition, Quantity
 
-HOST: Final = "127.0.0.1"
 ATTACH_S_MAX: Final = 5.0
 HUB_ANSWER_S_MAX: Final = 3.0
 FIRST_ANSWER_S_MAX: Final = 3.0  # a failover takes a millisecond, a paused laptop seconds
@@ -60,7 +59,7 @@ class BusOptions(msgspec.Struct, frozen=True):
     without it this is a stranger, and has no name.
     """
 
-    channel: str = "can0"
+    channel: str = CHANNEL
     port: int = 0
     secret: str = ""
     node: str = ""

@@ -29,6 +29,8 @@ import msgspec
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.condition import Condition
 
+HOST: Final = "127.0.0.1"
+CHANNEL: Final = "can0"
 NODES: Final = ("radar", "brake", "gateway")  # of a car's bus
 FALLBACK: Final = "fallback"  # reported by the brake ECU when its requests are missing
 GOOD_AGAIN: Final = "good_again"  # reported by a node that uses these frames again

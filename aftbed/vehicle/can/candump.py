@@ -2,33 +2,26 @@
 
     (0000000012.345678) can0 130#0102030405060708
 
-It is what `candump -l` of can-utils writes and what the hub records. A log is evidence: a line that is not
-exactly this is refused and counted by its reason, with the number of the first line that had it. A last line
-without its newline counts as torn even where it would parse: `130#01020304` may be all that was written of
-eight bytes.
+It is what the hub records, and `candump -l` of can-utils writes; `interop.logs` reads all that such programs
+write. The log of a hub is evidence: a line that is not exactly this is refused and counted by its reason,
+with the number of the first line that had it. A last line without its newline counts as torn even where it
+would parse: `130#01020304` may be all that was written of eight bytes.
 
 Read but not written: the direction (` R` or ` T`) that python-can's logger appends. Refused, being
 no classic CAN data frame with an 11-bit identifier: extended, remote, error and FD frames.
 
-Limits: 256 MiB for a file. Time is compared with the last frame that was accepted, over all
-interfaces, because the interfaces of a log share one clock.
+Time is compared with the last frame that was accepted, over all interfaces, because the interfaces of a log
+share one clock.
 """
 
-import io
 import re
 from collections.abc import Iterable, Iterator
 from enum import StrEnum
-from pathlib import Path
 from typing import Final
 
 import msgspec
 
-from aftbed.core.errors import ConfigError
 from aftbed.vehicle.can.frame import CAN_ID_MAX, DATA_LENGTH_MAX, Frame
-
-LOG_BYTES_MAX: Final = 256 * 1024 * 1024
-LINE_SHOWN_CHARACTERS_MAX: Final = 60
-EXPECTED: Final = "(SECONDS.MICROSECONDS) INTERFACE ID#HEX, e.g. (0000000012.345678) can0 130#01020304"
 
 _LINE: Final = re.compile(rb"\(([0-9]{1,10})\.([0-9]{6})\) ([!-~]{1,15}) ([!-~]{1,600}?)(?: [RT])?")
 _IDENTIFIER: Final = re.compile(rb"[0-9A-Fa-f]{3}")
@@ -103,24 +96,3 @@ def parse_lines(lines: Iterable[bytes], counts: LogCounts) -> Iterator[LogFrame]
         counts.frames += 1
         last_us = found.frame.t_us
         yield found
-
-
-def read_log(path: Path) -> tuple[list[LogFrame], LogCounts]:
-    """All frames of the log at `path`. Raises ConfigError if it cannot be read or has no frame."""
-    try:
-        size_bytes = path.stat().st_size
-        if size_bytes > LOG_BYTES_MAX:
-            raise ConfigError(f"{path}: {size_bytes} bytes, a log may have {LOG_BYTES_MAX}")
-        with path.open("rb") as file:
-            content = file.read(LOG_BYTES_MAX)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot read the log: {error.strerror}") from error
-    counts = LogCounts()
-    frames = list(parse_lines(io.BytesIO(content), counts))  # splits at newlines, nowhere else
-    if not frames:
-        shown = "the file is empty"
-        if content:
-            line = content.splitlines()[0].decode("ascii", "replace")
-            shown = f"line 1 is {line[:LINE_SHOWN_CHARACTERS_MAX]!r}"
-        raise ConfigError(f"{path}: no line is a CAN frame; {shown}, expected {EXPECTED}")
-    return frames, counts

@@ -25,7 +25,11 @@ A client that opens it without one is a stranger: a tool, of this user or of ano
 frames, and all receive its frames. What it does is counted for the record, by its user (`Stranger`). Users
 other than the hub's own are let in only on a bus that was started open. Strangers have limits, so that the
 nodes of the run get onto the bus and are served whatever strangers do; one that breaks a limit is told why by
-an error element, and put out.
+an error element, and put out. So is a connection that has to make room for another, and at the end of the run
+all strangers are told that it has ended.
+
+*To be found.* With a name to be found by, the hub sends a beacon of socketcand each second, as a datagram to
+127.0.0.1, where clients of socketcand listen for it; no other machine receives it.
 
 *Beside the bus* the nodes of the run, and only they, send elements of their own. One that gives its name can
 be cut off by a fault, and its reports count.
@@ -77,6 +81,7 @@ import sys
 import time
 from collections import Counter, deque
 from collections.abc import Sequence
+from contextlib import suppress
 from hmac import compare_digest
 from os import read, write
 from typing import Final, Protocol
@@ -85,9 +90,9 @@ import msgspec
 
 from aftbed.core.errors import AftbedError, ConfigError, HarnessError, PeerError
 from aftbed.core.units import number
-from aftbed.vehicle.can.bus_model import BusModel, BusNode, Notice
+from aftbed.vehicle.can.bus_model import CHANNEL, HOST, BusModel, BusNode, Notice
 from aftbed.vehicle.can.candump import log_line
-from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.can.frame import DATA_LENGTH_MAX, Frame
 from aftbed.vehicle.condition import Condition
 
 EVENTS_MAX: Final = 32  # in one round; the rest comes in the next
@@ -101,10 +106,14 @@ STRANGER_ELEMENTS_PER_S: Final = 2_000  # of all connections of a user; 500 kbit
 STRANGER_ELEMENTS_AT_ONCE: Final = 256
 STRANGER_USERS_MAX: Final = 8  # that are told apart; all others count as one
 LEAVE_S_MAX: Final = 1.0  # for a client that is put out to read why
+BEACON: Final = (HOST, 42000)  # where clients of socketcand listen
+BEACON_PERIOD_S: Final = 1.0  # python-can listens for 3.1 s
 OUTPUT_BYTES_MAX: Final = 256 * 1024
 FRAMES_QUEUED_MAX: Final = 256  # of one client
 
-_SEND: Final = re.compile(rb"< send ([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8}) ([0-9]) ((?:[0-9A-Fa-f]{1,2} ){0,8}) ?")
+_SEND: Final = re.compile(
+    rb"< send ([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8}) ([0-9A-Fa-f]) ((?:[0-9A-Fa-f]{1,2} ){0,8}) ?"
+)
 _OURS: Final = {  # elements of aftbed's nodes
     word: re.compile(rb"< aftbed %b %b" % (word, arguments))
     for word, arguments in {
@@ -131,12 +140,13 @@ class HubOptions(msgspec.Struct, frozen=True):
     """How the bus behaves. `origin_ns` is the start of the run by the monotonic clock.
 
     `secret` is what the nodes of the run open the bus with, in hexadecimal; without one all clients are
-    strangers. `open_to_all`: to other users, too.
+    strangers. `open_to_all`: to other users, too. `beacon`: the name in the beacon; "" sends none.
     """
 
-    channel: str = "can0"
+    channel: str = CHANNEL
     secret: str = ""
     open_to_all: bool = False
+    beacon: str = ""
     lockstep: bool = False
     pace: float = 1.0  # seconds of bus time in a second
     bitrate_bps: int | None = None  # None: a frame takes no time on the wire
@@ -290,6 +300,7 @@ class Hub(BusModel[HubConnection]):
         listener.setblocking(False)
         self._epoll.register(listener.fileno(), select.EPOLLIN)
         self._epoll.register(life_fd, select.EPOLLIN)
+        self._beacon = _Beacon(options, listener.getsockname()[1]) if options.beacon else None
 
     def run(self) -> HubCounts:
         """Carry frames until `life_fd` ends, and then those that had been sent by then."""
@@ -303,12 +314,17 @@ class Hub(BusModel[HubConnection]):
                 self._answer_await(*self._awaiting)
             if self._leaving:
                 self._end_leaving()
+            if self._beacon is not None:
+                self._beacon.send_if_due()
         self._epoll.unregister(self._life_fd)
         self._epoll.unregister(self._listener.fileno())
         end_s = time.monotonic() + LAST_FRAMES_S_MAX
         while time.monotonic() < end_s and (events := self._epoll.poll(0, EVENTS_MAX)):
             self._attend_all(events)
             self.carry(None if self._options.lockstep else self.now_us())
+        for client in list(self._clients.values()):
+            if client.account is not None and client.leaves_s is None:
+                self._say_last(client, "the run has ended")
         return self.counts()
 
     def counts(self) -> HubCounts:
@@ -349,13 +365,16 @@ class Hub(BusModel[HubConnection]):
         if self.disturbed and self.disturber is not None and not self._options.lockstep:
             fault_us = self.disturber.due_us()
             due_us = min((t_us for t_us in (due_us, fault_us) if t_us is not None), default=None)
-        leave_s = None if not self._leaving else max(0.0, (self._leaving[0].leaves_s or 0) - time.monotonic())
+        others_s = [self._leaving[0].leaves_s or 0] if self._leaving else []
+        if self._beacon is not None:
+            others_s.append(self._beacon.due_s)
+        other_s = max(0.0, min(others_s) - time.monotonic()) if others_s else None
         if due_us is None:
-            return self._epoll.poll(leave_s, EVENTS_MAX)
+            return self._epoll.poll(other_s, EVENTS_MAX)
         rest_us = due_us - self.now_us()
         if rest_us > 0:  # epoll counts milliseconds, select microseconds, and an epoll can be selected
             rest_s = rest_us / (1e6 * self._options.pace)
-            select.select([self._epoll], [], [], rest_s if leave_s is None else min(rest_s, leave_s))
+            select.select([self._epoll], [], [], rest_s if other_s is None else min(rest_s, other_s))
         return self._epoll.poll(0, EVENTS_MAX)
 
     def _attend_all(self, events: list[tuple[int, int]]) -> bool:
@@ -580,13 +599,29 @@ class Hub(BusModel[HubConnection]):
         except OSError:  # gone before it was accepted
             return
         if len(self._clients) >= CLIENTS_MAX:
-            self._counts.turned_away += 1
-            self._drop(min(self._clients.values(), key=_worth))
+            self._make_room(min(self._clients.values(), key=_worth))
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client = self._clients[sock.fileno()] = HubConnection(sock, self._newcomers)
         self._epoll.register(sock.fileno(), client.interest)
         self._send(client, b"< hi >")
+
+    def _make_room(self, client: HubConnection) -> None:
+        """Disconnect it at once, and tell it why."""
+        self._counts.turned_away += 1
+        reason = f"no room: there are {CLIENTS_MAX} connections, and this one is the least needed"
+        if client.account is not None:
+            client.account.did.turned_away += 1
+            self._tell(client.account, f"was turned away from the bus: {reason}")
+        self._say_last(client, reason)
+        self._drop(client)
+
+    def _say_last(self, client: HubConnection, reason: str) -> None:
+        """Tell it why it is disconnected next, as far as its socket takes that at once."""
+        client.outbox += self._error(reason)
+        with suppress(OSError):
+            client.sock.send(client.outbox, socket.MSG_NOSIGNAL)
+            client.sock.shutdown(socket.SHUT_WR)
 
     def _put_out(self, client: HubConnection, reason: str) -> None:
         """Send the reason behind what waits for it, take nothing more from it, and disconnect it then."""
@@ -681,6 +716,27 @@ class Hub(BusModel[HubConnection]):
             self._epoll.modify(client.sock.fileno(), interest)
 
 
+class _Beacon:
+    """Announces on this machine where the bus is. A beacon that cannot be sent is no trouble of the run."""
+
+    def __init__(self, options: HubOptions, port: int) -> None:
+        self.due_s = 0.0
+        self._text = (
+            f'<CANBeacon name="{options.beacon}" type="aftbed" description="a run of aftbed">\n'
+            f"<URL>can://{HOST}:{port}</URL>\n"
+            f'<Bus name="{options.channel}"/>\n'
+            "</CANBeacon>"
+        ).encode("ascii")
+
+    def send_if_due(self) -> None:
+        now_s = time.monotonic()
+        if now_s >= self.due_s:
+            self.due_s = now_s + BEACON_PERIOD_S
+            kind = socket.SOCK_DGRAM | socket.SOCK_NONBLOCK
+            with suppress(OSError), socket.socket(socket.AF_INET, kind) as sock:
+                sock.sendto(self._text, BEACON)
+
+
 def _is_stranger(client: HubConnection) -> bool:
     """Whether it is one that is on the bus."""
     return client.opened and client.account is not None and client.leaves_s is None
@@ -742,12 +798,13 @@ def parse_send(element: bytes, t_us: int) -> Frame:
     match = _SEND.fullmatch(element)
     if match is None:
         raise PeerError("malformed send")
-    identifier, length, text = match.groups()
+    identifier, code, text = match.groups()
     if len(identifier) != 3:
         raise PeerError("29-bit identifiers are not carried")
     data = bytes([int(byte, 16) for byte in text.split()])
-    if len(data) != int(length):
-        raise PeerError(f"length {int(length)} but {len(data)} bytes")
+    length = min(int(code, 16), DATA_LENGTH_MAX)  # codes 9 to 15 mean 8 bytes (ISO 11898-1)
+    if len(data) != length:
+        raise PeerError(f"length {length} but {len(data)} bytes")
     return Frame(t_us, int(identifier, 16), data)
 
 

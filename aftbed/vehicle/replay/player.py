@@ -1,25 +1,45 @@
-"""Replay: a candump log onto the bus, in the place of the car.
+"""Replay: the frames of a log onto the bus, in the place of the car.
 
-The frames of all interfaces of the log go to the one bus, in the order of the log. Bus time starts at
-0 with the first of them and then follows the log's stamps: on the wall clock when paced, or as the
-virtual time of the hub in lockstep (`pace` None). All goes through one connection, so the hub takes
-times and frames in the order in which they are sent.
+The frames of all interfaces of the log go to the one bus, in the order of the log; which of them the bus can
+carry was found out before (`PlayedLog`). Bus time starts at 0 with the first of them and then follows the
+log's stamps: on the wall clock when paced, or as the virtual time of the hub in lockstep (`pace` None). All
+goes through one connection, so the hub takes times and frames in the order in which they are sent.
 
 Only the caller knows which frame ends a radar cycle and so makes a request: most simply by a second gateway
 that gets the same frames and decides as the first does. In lockstep time stands still after such a frame
 until the AEB_REQ that answers it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import takewhile
 
 import msgspec
 
 from aftbed.core.errors import PeerError
 from aftbed.vehicle.aeb.messages import STAGE_PARTIAL
 from aftbed.vehicle.can.bus import AnswerWatch, Bus, Schedule
-from aftbed.vehicle.can.candump import LogFrame
 from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.frame import Frame
+
+
+class LogReport(msgspec.Struct, frozen=True):
+    """What a log held: the frames to play, and those left out, by reason.
+
+    `skipped`: parts of the file that could not be read, the first of them where and why.
+    """
+
+    format: str
+    frames: int
+    left_out: dict[str, int]
+    skipped: int
+    first_skipped: str
+
+
+class PlayedLog(msgspec.Struct, frozen=True):
+    """Frames to play, in the order of time, by the clock of their log."""
+
+    frames: tuple[Frame, ...]
+    report: LogReport
 
 
 class PlayReport(msgspec.Struct):
@@ -46,20 +66,25 @@ class PlayReport(msgspec.Struct):
 
 
 def play(
-    log: Sequence[LogFrame],
+    log: Sequence[Frame],
     codec: Codec,
     bus: Bus,
     pace: float | None,
     *,
     ends_cycle: Callable[[Frame], bool],
     stop: Callable[[], bool],
+    pause_us: int | None = None,
+    until_us: int | None = None,
 ) -> PlayReport:
     """Play `log` to its end, or until `stop()`, which is asked before every frame.
+
+    With a pause, it begins again that long behind its last frame, and so on. `until_us` of bus time, or
+    without it the end of the log, is its end as asked for.
 
     `ends_cycle` is asked once for each frame, in order, with the bus time in the frame. Raises
     HarnessError when the bus fails.
     """
-    return _Player(codec, bus, pace, stop).run(log, ends_cycle)
+    return _Player(codec, bus, pace, stop).run(log, ends_cycle, pause_us, until_us)
 
 
 class _Player:
@@ -72,9 +97,18 @@ class _Player:
         self._answer_id = codec.can_id("AEB_REQ")
         self._watch = AnswerWatch(bus, self._answer_id, self._receive)
 
-    def run(self, log: Sequence[LogFrame], ends_cycle: Callable[[Frame], bool]) -> PlayReport:
+    def run(
+        self,
+        log: Sequence[Frame],
+        ends_cycle: Callable[[Frame], bool],
+        pause_us: int | None,
+        until_us: int | None,
+    ) -> PlayReport:
         report, schedule = self._report, self._schedule
-        report.complete = self._play(log, ends_cycle)
+        frames = _in_bus_time(log, pause_us)
+        if until_us is not None:
+            frames = takewhile(lambda frame: frame.t_us < until_us, frames)
+        report.complete = self._play(frames, ends_cycle)
         if report.complete and schedule is not None:
             self._watch.wait(self._stop)
         report.refused = self._bus.errors
@@ -82,11 +116,10 @@ class _Player:
         report.lag_ms_max = 0.0 if schedule is None else schedule.lag_ms_max
         return report
 
-    def _play(self, log: Sequence[LogFrame], ends_cycle: Callable[[Frame], bool]) -> bool:
-        """True if the whole log was sent."""
-        start_us, last_us = log[0].frame.t_us if log else 0, -1
-        for entry in log:
-            frame = Frame(entry.frame.t_us - start_us, entry.frame.can_id, entry.frame.data)
+    def _play(self, frames: Iterator[Frame], ends_cycle: Callable[[Frame], bool]) -> bool:
+        """True if all were sent."""
+        last_us = -1
+        for frame in frames:
             if self._schedule is not None:
                 self._schedule.wait_until(frame.t_us, self._stop)
             elif frame.t_us != last_us:
@@ -115,3 +148,14 @@ class _Player:
             return
         report.stage_max = max(report.stage_max, int(answer["STAGE"]))
         report.deceleration_ms2_max = max(report.deceleration_ms2_max, answer["DECELERATION"])
+
+
+def _in_bus_time(log: Sequence[Frame], pause_us: int | None) -> Iterator[Frame]:
+    """The frames of the log once, or with a pause again and again."""
+    begins_us = 0
+    while log:
+        for frame in log:
+            yield Frame(begins_us + frame.t_us - log[0].t_us, frame.can_id, frame.data)
+        if pause_us is None:
+            return
+        begins_us += log[-1].t_us - log[0].t_us + pause_us

@@ -26,12 +26,17 @@ def scenario_names() -> list[str]:
     return sorted(path.stem for path in _FOLDER.glob("*.yaml"))
 
 
+def names_file(name_or_path: str) -> bool:
+    """Whether it is the path of a file, not a name."""
+    return "/" in name_or_path or name_or_path.endswith((".yaml", ".yml"))
+
+
 def load_scenario(name_or_path: str) -> Scenario:
     """A shipped scenario or a row of a table by name, or a file by path.
 
     A path is whatever has a slash or ends in .yaml or .yml; a row is what has a colon, as in `r152:m1-60`.
     """
-    if "/" in name_or_path or name_or_path.endswith((".yaml", ".yml")):
+    if names_file(name_or_path):
         path = Path(name_or_path)
     elif SEPARATOR in name_or_path:
         return case_scenario(name_or_path)

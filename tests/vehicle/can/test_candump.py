@@ -1,14 +1,12 @@
 """candump lines: one form written, exactly that form read, everything else counted."""
 
-from pathlib import Path
-
 import can
 import pytest
+from buslog import read_log
 from hypothesis import given
 from hypothesis import strategies as st
 from puredrive import TOYOTA_LOG
 
-from aftbed.core.errors import ConfigError
 from aftbed.vehicle.can.candump import (
     LogCounts,
     LogFrame,
@@ -16,7 +14,6 @@ from aftbed.vehicle.can.candump import (
     log_line,
     parse_line,
     parse_lines,
-    read_log,
 )
 from aftbed.vehicle.can.frame import Frame
 
@@ -108,34 +105,6 @@ def test_any_lines_are_counted_whole(lines: list[bytes]) -> None:
     assert counts.lines == len(lines) == counts.frames + sum(counts.refused.values())
     assert counts.frames == len(found)
     assert set(counts.refused) == set(counts.first_line)
-
-
-@given(st.binary(max_size=300))
-def test_any_file_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
-    path = tmp_path_factory.getbasetemp() / "any.log"
-    path.write_bytes(content)
-    try:
-        found, counts = read_log(path)
-    except ConfigError as error:
-        assert str(path) in str(error)
-    else:
-        assert len(found) == counts.frames > 0
-
-
-def test_a_file_without_any_frame_is_a_usage_error(tmp_path: Path) -> None:
-    path = tmp_path / "not.log"
-    path.write_text("VERSION 1\nBO_ 256 AEB_REQ\n")
-    with pytest.raises(
-        ConfigError, match=r"not\.log: no line is a CAN frame; line 1 is 'VERSION 1', expected"
-    ):
-        read_log(path)
-    path.write_text("")
-    with pytest.raises(ConfigError, match="the file is empty"):
-        read_log(path)
-    with pytest.raises(ConfigError, match="No such file"):
-        read_log(tmp_path / "none.log")
-    with pytest.raises(ConfigError, match="directory"):
-        read_log(tmp_path)
 
 
 @pytest.mark.skipif(not REAL_LOG.exists(), reason="the recorded drive is not here")

@@ -11,12 +11,13 @@ from pathlib import Path
 import can
 import pytest
 from busharness import DEADLINE_S, SECRET, RawClient, RunningHub, hub_process, running_hub
+from buslog import read_log
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.vehicle.can.bus_model import frame_bits
-from aftbed.vehicle.can.candump import LogCounts, Refusal, parse_lines, read_log
+from aftbed.vehicle.can.candump import LogCounts, Refusal, parse_lines
 from aftbed.vehicle.can.hub import ELEMENT_BYTES_MAX, HubOptions, parse_send
 
 LOCKSTEP = HubOptions(lockstep=True)
@@ -41,6 +42,15 @@ def test_a_frame_goes_to_all_but_its_sender(hub: RunningHub) -> None:
             assert (words[:3], words[4:]) == (["<", "frame", "130"], ["01A0FF", ">"])
         assert a.ask("< echo >") == "< echo >"  # nothing came before it
     assert hub.stop().frames == 1
+
+
+@pytest.mark.parametrize("code", [8, 9, 15])
+def test_a_tool_may_send_a_length_code_above_8_which_means_8_bytes(hub: RunningHub, code: int) -> None:
+    """As python-can does with a frame of such a log (ISO 11898-1)."""
+    with RawClient(hub.port) as b, attach(hub.port) as tool:
+        tool.send(can.Message(arbitration_id=0x130, is_extended_id=False, data=bytes(range(8)), dlc=code))
+        assert b.read().split()[4] == "0001020304050607"
+    assert hub.stop().refused == 0
 
 
 def test_the_log_has_what_was_relayed(hub: RunningHub) -> None:
@@ -228,6 +238,8 @@ def test_options_on_which_no_time_would_pass(options: dict[str, float]) -> None:
         "< send 130 2 1 >",
         "< send 130 1 1 2 >",
         "< send 130 9 1 2 3 4 5 6 7 8 9 >",
+        "< send 130 F 1 2 3 4 5 6 7 >",
+        "< send 130 10 1 2 3 4 5 6 7 8 >",
         "< send 130 1 123 >",
         "< send 130 1 -1 >",
         "< send 130 1 0x1 >",
@@ -359,7 +371,7 @@ def test_a_slow_reader_is_put_out_and_the_others_do_not_notice(tmp_path: Path) -
 def test_the_end_of_the_life_descriptor_ends_the_hub(hub: RunningHub) -> None:
     with RawClient(hub.port) as a:
         hub.stop()
-        assert a.read() == ""
+        assert a.read().endswith("the run has ended >") and a.read() == ""
 
 
 def test_what_was_sent_before_the_end_is_recorded(hub: RunningHub) -> None:

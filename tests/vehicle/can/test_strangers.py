@@ -15,6 +15,7 @@ from typing import Final
 import can
 import pytest
 from busharness import DEADLINE_S, SECRET, RawClient, RunningHub, running_hub
+from can.interfaces.socketcand import socketcand
 
 from aftbed.vehicle.can import hub as hub_module
 from aftbed.vehicle.can.bus import open_bus
@@ -248,9 +249,11 @@ def test_connections_that_never_open_the_bus_make_room(hub: RunningHub) -> None:
     with ExitStack() as stack:
         idle = [stack.enter_context(RawClient(hub.port, raw=False)) for _ in range(CLIENTS_MAX)]
         served(hub)
-        assert idle[0].read() == "", "the oldest has gone"
+        assert f"no room: there are {CLIENTS_MAX} connections" in last_words(idle[0]), "the oldest has gone"
         assert idle[-1].ask("< echo >") == "< echo >"
-    assert hub.stop().turned_away >= 3
+    counts = hub.stop()
+    assert counts.turned_away >= 3
+    assert counts.strangers == [Stranger(None, turned_away=counts.turned_away)]
 
 
 def test_a_stranger_that_sends_too_fast_is_put_out_and_told(hub: RunningHub) -> None:
@@ -357,6 +360,50 @@ def test_a_client_that_goes_while_it_is_put_out_is_no_trouble(
     client.write("< open can0 >" + "x" * 2 * ELEMENT_BYTES_MAX)
     served(hub)
     assert hub.stop().oversized == 1
+
+
+# -- to be found, and told of the end
+
+
+def test_python_can_finds_the_bus_by_its_beacon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        listens_at = free.getsockname()
+    monkeypatch.setattr(hub_module, "BEACON", listens_at)
+    monkeypatch.setattr(socketcand, "DEFAULT_SOCKETCAND_DISCOVERY_PORT", listens_at[1])
+    with running_hub(tmp_path / "bus.log", HubOptions(beacon="aftbed run 3f09c1")) as hub:
+        (found,) = can.detect_available_configs(interfaces=["socketcand"])
+        where = {"host": "127.0.0.1", "port": hub.port, "channel": "can0"}
+        assert dict(found) == {"interface": "socketcand"} | where
+        with can.Bus(**found), RawClient(hub.port) as other:
+            other.fence()
+        assert hub.stop().strangers == [Stranger(ME, connections=2)]
+
+
+def test_the_beacon_leaves_this_machine_by_no_interface() -> None:
+    assert hub_module.BEACON == ("127.0.0.1", socketcand.DEFAULT_SOCKETCAND_DISCOVERY_PORT)
+
+
+def test_without_a_name_there_is_no_beacon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear:
+        ear.bind(("127.0.0.1", 0))
+        monkeypatch.setattr(hub_module, "BEACON", ear.getsockname())
+        with running_hub(tmp_path / "bus.log") as hub:
+            served(hub)
+        assert not select.select([ear], [], [], 0)[0]
+
+
+def test_strangers_are_told_when_the_run_ends_and_its_nodes_are_not(hub: RunningHub) -> None:
+    with (
+        RawClient(hub.port) as stranger,
+        RawClient(hub.port, raw=False) as newcomer,
+        RawClient(hub.port, ours=True) as node,
+    ):
+        hub.stop()
+        for client in (stranger, newcomer):
+            assert client.read().endswith(" the run has ended >")
+            assert client.read() == ""
+        assert node.read() == ""
 
 
 # -- what is told of them

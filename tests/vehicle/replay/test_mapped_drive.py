@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 import yaml
+from buslog import read_log
 from puredrive import CODEC, TOYOTA_DBC, TOYOTA_LOG
 
 from aftbed.core.errors import ConfigError
 from aftbed.vehicle.aeb.function import AebFunction
 from aftbed.vehicle.aeb.messages import decode_reply, decode_request
-from aftbed.vehicle.can.candump import read_log
 from aftbed.vehicle.can.dbc_file import load_dbc
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.replay.map_file import Messages, bind, find_map

@@ -11,6 +11,7 @@ from random import Random
 
 import msgspec
 import pytest
+from buslog import read_log
 from hypothesis import given
 from hypothesis import strategies as st
 from puredrive import CODEC
@@ -26,7 +27,6 @@ from aftbed.vehicle.aeb.messages import (
     decode_reply,
     decode_request,
 )
-from aftbed.vehicle.can.candump import read_log
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.replay.map_file import bind, find_dbc, find_map
 from aftbed.vehicle.replay.mapped_gateway import MappedGateway

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 from busharness import TestGateway, running_hub
+from buslog import read_log
 
 from aftbed.vehicle.can import bus as bus_module
 from aftbed.vehicle.can.bus import open_bus
-from aftbed.vehicle.can.candump import LogFrame, read_log
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.hub import HubOptions
@@ -28,13 +28,13 @@ def never() -> bool:
     return False
 
 
-def log_of(cycles: int, cycle_us: int = 50_000) -> list[LogFrame]:
-    """Radar on can1, three frames in a batch, and the speed on can0 between two batches."""
+def log_of(cycles: int, cycle_us: int = 50_000) -> list[Frame]:
+    """Three frames of the radar in a batch, and the speed between two batches."""
     entries = []
     for n in range(cycles):
         t_us, data = START_US + n * cycle_us, n.to_bytes(2, "big")
-        entries += [LogFrame("can1", Frame(t_us, can_id, data)) for can_id in (0x210, 0x211, CYCLE_END_ID)]
-        entries.append(LogFrame("can0", Frame(t_us + cycle_us // 2, 0x0B4, data)))
+        entries += [Frame(t_us, can_id, data) for can_id in (0x210, 0x211, CYCLE_END_ID)]
+        entries.append(Frame(t_us + cycle_us // 2, 0x0B4, data))
     return entries
 
 
@@ -52,10 +52,12 @@ class Stop:
 def run(
     log: Path,
     codec: Codec,
-    entries: list[LogFrame],
+    entries: list[Frame],
     pace: float | None,
     answers: list[tuple[int, float] | None],
     stop: Stop | None = None,
+    pause_us: int | None = None,
+    until_us: int | None = None,
 ) -> PlayReport:
     """Play `entries` to a gateway that gives `answers` in turn, the last one for good."""
     with running_hub(log, HubOptions(lockstep=pace is None, pace=pace or 1.0)) as hub:
@@ -71,6 +73,8 @@ def run(
                     pace,
                     ends_cycle=lambda frame: frame.can_id == CYCLE_END_ID,
                     stop=stop or never,
+                    pause_us=pause_us,
+                    until_us=until_us,
                 )
             finally:
                 bus.close()
@@ -86,9 +90,7 @@ def test_lockstep_follows_the_stamps_and_waits_for_each_answer(tmp_path: Path, c
     assert logs[0].read_bytes() == logs[1].read_bytes()
     played = [entry.frame for entry in read_log(logs[0])[0]]
     relayed = [frame for frame in played if frame.can_id not in (0x100, 0x701)]
-    assert relayed == [
-        Frame(entry.frame.t_us - START_US, entry.frame.can_id, entry.frame.data) for entry in entries
-    ]
+    assert relayed == [Frame(entry.t_us - START_US, entry.can_id, entry.data) for entry in entries]
     for before, frame in pairwise(played):
         if frame.can_id == 0x100:  # at the time of the frame that it answers
             assert before.t_us == frame.t_us
@@ -128,5 +130,24 @@ def test_play_can_be_stopped(pace: float | None, tmp_path: Path, codec: Codec) -
     assert report.sent < 40
 
 
-def test_an_empty_log_is_played(tmp_path: Path, codec: Codec) -> None:
-    assert run(tmp_path / "bus.log", codec, [], None, [(0, 0.0)]) == PlayReport(complete=True)
+def test_a_log_is_played_again_and_again_until_its_time_is_over(tmp_path: Path, codec: Codec) -> None:
+    """Two cycles, of which the last frame comes 75 ms after the first, and a pause of 25 ms."""
+    given: dict[str, int] = {"pause_us": 25_000, "until_us": 250_001}
+    report = run(tmp_path / "bus.log", codec, log_of(2), None, [(0, 0.0)], **given)
+    assert (report.sent, report.cycles, report.answers, report.complete) == (8 + 8 + 7, 6, 6, True)
+    times_us = [e.frame.t_us for e in read_log(tmp_path / "bus.log")[0] if e.frame.can_id == CYCLE_END_ID]
+    assert times_us == [0, 50_000, 100_000, 150_000, 200_000, 250_000]
+
+
+@pytest.mark.parametrize(("until_us", "sent"), [(0, 0), (1, 3), (25_001, 4), (10_000_000, 8)])
+def test_a_log_is_played_until_its_time_is_over_or_it_ends(
+    until_us: int, sent: int, tmp_path: Path, codec: Codec
+) -> None:
+    report = run(tmp_path / "bus.log", codec, log_of(2), None, [(0, 0.0)], until_us=until_us)
+    assert (report.sent, report.complete) == (sent, True)
+
+
+@pytest.mark.parametrize("pause_us", [None, 1000])
+def test_an_empty_log_is_played(pause_us: int | None, tmp_path: Path, codec: Codec) -> None:
+    played = run(tmp_path / "bus.log", codec, [], None, [(0, 0.0)], pause_us=pause_us)
+    assert played == PlayReport(complete=True)
