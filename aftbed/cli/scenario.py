@@ -27,7 +27,7 @@ SUBCOMMANDS: Final[CommandTable] = {
     ),
     "import": (
         "scenario_import:import_",
-        "Make scenario files of an OpenSCENARIO 1.0 to 1.3 file; all or nothing.",
+        "Make scenario files of OpenSCENARIO 1.0 to 1.3 files; all of a file or nothing.",
     ),
 }
 

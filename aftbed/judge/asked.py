@@ -151,7 +151,7 @@ def _replay(record: RunRecord) -> list[str] | None:
 
 
 def _drive(record: RunRecord) -> list[str] | None:
-    """A drive ends at a standstill, in a collision, as slow as its scenario says, or after as long as it may."""
+    """A drive ends at a standstill, in a collision, as slow or as late as its scenario says."""
     work, drive = record.options.work, record.drive
     if not isinstance(work, CarRun) or not _ended_by_itself(record) or drive is None:
         return None  # without a drive the car did not report: `vehicle` tells

@@ -120,9 +120,11 @@ def breaches(
 
 def needless_stops(run: Run) -> tuple[Breach, ...]:
     """A brick that stopped itself, though nothing that it was given can have been altered, or was late."""
-    hosted = (run.setup.ftm, *(a.goal.expression for a in run.setup.adaptations if a.goal.expression))
-    harmless = () if any(detects(ftm, "flow") for ftm in hosted) else HARMLESS  # each of them delays a step
-    if not all(isinstance(fault.action, harmless) for fault in run.setup.faults):
+    hosted = (run.setup.ftm, *(one.tried_ftm or one.ftm for one in run.adaptations))
+    timed = any(detects(ftm, "flow") for ftm in hosted)  # what delays a step may stop it: a fault, a failover
+    if timed and (run.setup.faults or run.history.events(Event.WATCHDOG_SUSPECT)):
+        return ()
+    if not all(isinstance(fault.action, HARMLESS) for fault in run.setup.faults):
         return ()
     stops = run.history.events(Event.DETECTED_STOP)
     return tuple(Breach("needless_stop", f"{r.node} stopped at request {r.request_id}") for r in stops)

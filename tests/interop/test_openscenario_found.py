@@ -674,7 +674,10 @@ def test_some_of_the_variations(tmp_path: Path) -> None:
     path = tmp_path / "varied.xosc"
     path.write_text(osc.distribution("rear.xosc", Ego_kph=["10", "20", "30"], Overlap=["100", "75"]))
     found = _picked(path, ("Ego_kph", "20.0"), ("Ego_kph", "30"), ("Overlap", "75"))
-    assert [one.name for one in found.variations] == ["varied-Ego_kph-20", "varied-Ego_kph-30"]
+    assert [one.name for one in found.variations] == [
+        "varied-Ego_kph-20-Overlap-75",
+        "varied-Ego_kph-30-Overlap-75",
+    ]
 
 
 def _picked(path: Path, *pick: tuple[str, str]) -> ImportedFile:

@@ -140,7 +140,7 @@ def import_scenario(
     ignored: list[tuple[IgnoredElement, ...]] = []
     catalogs = catalogs or Catalogs()
     for values in sets:
-        shown = values if stem == scenario.stem else _varying(values, sets)
+        shown = values if stem == scenario.stem else _varying(values, sets, options.pick)
         try:
             drive, unused = _read(substituted(root, values), options, catalogs)
             name = variation_name(stem, shown)
@@ -180,9 +180,14 @@ def check_options(options: ImportOptions) -> None:
         raise ConfigError(f"--duration: found {options.duration_s:g}, {allowed}")
 
 
-def _varying(values: Values, sets: list[Values]) -> Values:
-    """The values that are not the same in all sets."""
-    return {name: value for name, value in values.items() if any(one[name] != value for one in sets)}
+def _varying(values: Values, sets: list[Values], pick: Sequence[tuple[str, str]] = ()) -> Values:
+    """The values that are not the same in all sets, and those that were picked: their names stay the same."""
+    picked = {name for name, _ in pick}
+    return {
+        name: value
+        for name, value in values.items()
+        if name in picked or any(one[name] != value for one in sets)
+    }
 
 
 def _with_values(error: RefusedError, values: Values) -> RefusedError:
