@@ -79,7 +79,7 @@ def test_what_is_false_is_seen_at_once(call: Call) -> None:
         "because    in a new instance, restored from the state behind request 3: the reply to request 4:"
         " byte 8 is 0x01 instead of 0x04",
     ]
-    assert "suits      none, lfr, assert, lfr+assert" in lines
+    assert "suits      none, lfr, assert, sup, lfr+assert, lfr+sup" in lines
     assert lines[-1] == f"{source} is not what it declares"
 
 
