@@ -8,6 +8,8 @@ from campaigns import CRASHES, planned, ran
 from aftbed.campaign import ledger, runner
 from aftbed.core.errors import ConfigError
 
+pytestmark = pytest.mark.simulation
+
 
 def told(found: ledger.Ledger) -> list[tuple[object, ...]]:
     return [(r.experiment, r.outcome, r.faults, r.recovery_ms) for r in found.results]

@@ -17,6 +17,8 @@ from aftbed.core.errors import ConfigError
 from aftbed.functions.load import OWN_CODE
 from aftbed.runtime.unix.trust import OWN_RUN
 
+pytestmark = pytest.mark.simulation
+
 SUITABLE = """
 campaign: try
 system: {requests: 30, runtime: sim, app: function.py:Counter, request_file: requests.csv}

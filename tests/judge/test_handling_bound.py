@@ -17,6 +17,8 @@ from aftbed.judge.intervals import intervals
 from aftbed.judge.simulated import evidence_of_run
 from aftbed.runtime.sim.world import Setup, simulate
 
+pytestmark = pytest.mark.simulation
+
 SEEDS = 5
 NEAR = {  # the least share of its bound that the worst of a few seeds comes to
     "crash primary after {ms}ms": 0.2,

@@ -11,6 +11,8 @@ from aftbed.judge.intervals import intervals
 from aftbed.judge.simulated import evidence_of_run
 from aftbed.runtime.sim.world import Run, Setup, World, simulate
 
+pytestmark = pytest.mark.simulation
+
 DRIVE: Final = "ccrs-20"
 
 

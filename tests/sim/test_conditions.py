@@ -14,6 +14,8 @@ from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.world import Run, Setup, World, simulate
 from aftbed.search.shrink import shrink
 
+pytestmark = pytest.mark.simulation
+
 DRIVE: Final = "ccrs-20"
 HELD_US: Final = 2_000_000  # ttc < 2 in this drive: at 20 km/h, 11.1 m before the obstacle
 SOON_NS: Final = 600_000  # from the step to a death that was ordered at it

@@ -12,6 +12,8 @@ from aftbed.judge.simulated import breaches
 from aftbed.runtime.script_executor import Changes, Rebinding
 from aftbed.runtime.sim.world import Setup, simulate
 
+pytestmark = pytest.mark.simulation
+
 WAYS: Final = [
     (old, new, placement)
     for old, new in [("pbr", "lfr"), ("lfr", "pbr"), ("pbr", "pbr+tr"), ("lfr+tr", "lfr"), ("pbr", "tr")]

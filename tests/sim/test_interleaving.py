@@ -17,6 +17,8 @@ from aftbed.runtime.sim.interleaving import Chooser, HeldChannel, orders
 from aftbed.runtime.sim.world import Doom, Setup, World
 from aftbed.search.explore import all_orders, experiments
 
+pytestmark = pytest.mark.simulation
+
 
 @pytest.mark.parametrize(
     ("ftm", "placement", "count", "expected"),

@@ -19,6 +19,8 @@ from aftbed.judge.simulated import breaches
 from aftbed.runtime.sim.processes import SimProcess
 from aftbed.runtime.sim.world import Setup, World
 
+pytestmark = pytest.mark.simulation
+
 STOPPED_MS: Final = 110  # longer than a replacement takes
 SPREAD: Final = 200  # steps over which those that are tried each time are spread; the deep form tries all
 PLACEMENTS: Final = ("process", "replica")

@@ -18,6 +18,8 @@ from aftbed.judge.simulated import breaches
 from aftbed.runtime.sim.world import Doom, Run, Setup, World
 from aftbed.vehicle.aeb.function import default_application
 
+pytestmark = pytest.mark.simulation
+
 VERSIONS: Final = str(Path(versions.__file__).resolve())
 ONE_WAY: Final = "aftbed.vehicle.aeb.variants:Cautious"  # the first version refuses its state
 FIRST: Final = 4  # the request at which the update begins

@@ -31,6 +31,8 @@ from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.replay.map_file import bind, find_dbc, find_map
 from aftbed.vehicle.replay.mapped_gateway import MappedGateway
 
+pytestmark = pytest.mark.simulation
+
 APPROACH = (STANDING, *FAR)
 
 

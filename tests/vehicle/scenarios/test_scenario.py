@@ -25,6 +25,8 @@ from aftbed.vehicle.plant import (
 from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
 from aftbed.vehicle.scenarios.scenario import SlowEnd, broken_expectations
 
+pytestmark = pytest.mark.simulation
+
 NAMES = ["ccrb-50-12m", "ccrb-50-40m", "ccrm-50", "ccrs-20", "ccrs-42", "ccrs-50", "free-drive"]
 
 
