@@ -11,7 +11,7 @@ pytestmark = pytest.mark.process
 PROCESSES: Final = {("--jobs", "1"): 17, ("--placement", "replica"): 9}  # the nodes and the supervisor
 
 
-@pytest.mark.parametrize("options", [("--jobs", "1"), ("--placement", "replica"), ("--sim",)])
+@pytest.mark.parametrize("options", [("--placement", "replica"), ("--sim",)])
 def test_every_experiment_is_carried_out(home: Home, options: tuple[str, ...]) -> None:
     done = aftbed("bench", "campaign", "--experiments", "4", "--rounds", "2", *options, "--json")
     assert done.code == 0, done.err

@@ -90,7 +90,10 @@ def whole(ftm: str, placement: str, leader: str = "a") -> set[tuple[str, str]]:
     return {(b.name, b.kind) for b in build(ftm, placement, leader).bricks}
 
 
-@pytest.mark.parametrize("placement", PLACEMENTS)
+@pytest.mark.parametrize(
+    "placement",
+    [pytest.param(one, marks=[pytest.mark.deep] if one == "single" else []) for one in PLACEMENTS],
+)
 @pytest.mark.parametrize(
     "mechanisms",
     [

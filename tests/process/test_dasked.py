@@ -83,6 +83,7 @@ def test_a_cluster_comes_to_the_same_results_though_a_worker_is_killed(tmp_path:
     ]
 
 
+@pytest.mark.deep  # a real experiment is the same on any worker
 def test_real_processes_on_a_cluster(tmp_path: Path) -> None:
     text = CRASHES.replace("runtime: sim", "runtime: unix").replace("experiments: 4", "experiments: 1")
     asked = planned(tmp_path, text)
@@ -140,6 +141,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.deep  # the scheduler and the workers are those of the first test
 def test_a_local_cluster_comes_to_the_same_results(tmp_path: Path) -> None:
     """Dask's own way to have a few workers, what a user tries first: here in a process of its own."""
     found = planned(tmp_path)

@@ -71,8 +71,8 @@ def fail_over(run: Started, count: int) -> None:
 @pytest.mark.parametrize(
     ("placement", "count"),
     [
-        ("process", 10),
-        ("replica", 10),
+        ("process", 6),
+        ("replica", 6),
         pytest.param("process", 1000, marks=[pytest.mark.deep, pytest.mark.timeout(1200)]),
         pytest.param("replica", 1000, marks=[pytest.mark.deep, pytest.mark.timeout(1200)]),
     ],
@@ -102,7 +102,7 @@ def adapt_back_and_forth(run: Started, count: int) -> None:
 @pytest.mark.parametrize(
     ("placement", "count"),
     [
-        ("process", 10),
+        ("process", 6),
         pytest.param("process", 1000, marks=[pytest.mark.deep, pytest.mark.timeout(1200)]),
         pytest.param("replica", 1000, marks=[pytest.mark.deep, pytest.mark.timeout(1200)]),
     ],
