@@ -194,7 +194,7 @@ def execute(given: RunArguments) -> int:
     check_file("--junit", given.junit)
     check_file("--html", given.html)
     write_files = _files(given)
-    page = _page(given)
+    _check_page(given)
     options, listener = options_for(
         ftm=graph.ftm,
         placement=given.placement,
@@ -213,33 +213,38 @@ def execute(given: RunArguments) -> int:
         command=shlex.join(("aftbed", *sys.argv[1:])),
         evidence=given.junit is not None,
     )
-    launched = launch(options, listener, requests, log)
-    del log  # it may be large, and the run has it
-    try:
-        closed = make_loop(launched) if make_loop is not None else None
-        with page(launched.private):
+    with contextlib.ExitStack() as page:
+        if given.web:  # before the launch, whose processes would inherit its socket
+            page.enter_context(_page(given, Path(options.private)))
+        launched = launch(options, listener, requests, log)
+        del log  # it may be large, and the run has it
+        try:
+            closed = make_loop(launched) if make_loop is not None else None
             interrupted = _follow(launched, open_view(options, quiet=given.json), closed)
-        launched.wait()
-        from aftbed.cli.check import judge_and_show, write_html, write_junit  # noqa: PLC0415 - after the launch
-        from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED  # noqa: PLC0415 - after the launch
-        from aftbed.runtime.unix.trust import OWN_RUN, remember  # noqa: PLC0415 - after the launch
+            page.close()
+            launched.wait()
+            from aftbed.cli.check import judge_and_show, write_html, write_junit  # noqa: PLC0415 - after the launch
+            from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED  # noqa: PLC0415 - after the launch
+            from aftbed.runtime.unix.trust import OWN_RUN, remember  # noqa: PLC0415 - after the launch
 
-        if why_not := remember(launched.record):
-            text = f"aftbed check will ask for --trust: what was run cannot be remembered: {why_not}"
-            print(f"aftbed: note: {text}", file=sys.stderr)
-        verdict = judge_and_show(launched.record, OWN_RUN, as_json=given.json)
-        if launched.trouble:
-            print(f"aftbed: trouble: {launched.trouble}", file=sys.stderr)
-        elif verdict.verdict == "inconclusive" and not given.json:
-            _show_log(launched.record / "processes.log")
-        writers = [partial(write_files, launched.record)] if write_files is not None else []
-        writers += [partial(write_junit, given.junit, verdict)] if given.junit is not None else []
-        writers += (
-            [partial(write_html, given.html, launched.record, verdict)] if given.html is not None else []
-        )
-        unwritten = [write for write in writers if not _written(write, as_json=given.json)]
-    finally:
-        launched.remove()
+            if why_not := remember(launched.record):
+                text = f"aftbed check will ask for --trust: what was run cannot be remembered: {why_not}"
+                print(f"aftbed: note: {text}", file=sys.stderr)
+            verdict = judge_and_show(launched.record, OWN_RUN, as_json=given.json)
+            if launched.trouble:
+                print(f"aftbed: trouble: {launched.trouble}", file=sys.stderr)
+            elif verdict.verdict == "inconclusive" and not given.json:
+                _show_log(launched.record / "processes.log")
+            writers = list[Callable[[], list[str]]]()
+            if write_files is not None:
+                writers.append(partial(write_files, launched.record))
+            if given.junit is not None:
+                writers.append(partial(write_junit, given.junit, verdict))
+            if given.html is not None:
+                writers.append(partial(write_html, given.html, launched.record, verdict))
+            unwritten = [write for write in writers if not _written(write, as_json=given.json)]
+        finally:
+            launched.remove()
     code = EXIT_CODES[verdict.verdict]
     return EXIT_INTERRUPTED if interrupted else code or (EXIT_CODES["inconclusive"] if unwritten else 0)
 
@@ -407,12 +412,14 @@ def _sent(source: "RequestSource", given: RunArguments) -> LoadRun:
     return LoadRun(source.count, rate_hz, source.name, expect)
 
 
-def _page(given: RunArguments) -> Callable[[Path], AbstractContextManager[None]]:
-    """What serves the page of the run in a private directory; nothing without `--web`."""
+def _check_page(given: RunArguments) -> None:
     if not given.web:
         _refuse(given, ("port", "open_page"), "only with --web: leave out")
-        return lambda private: contextlib.nullcontext()
     check_range("--port", given.port, 0, 65535)
+
+
+def _page(given: RunArguments, private: Path) -> AbstractContextManager[None]:
+    """What serves the page of the run in `private`; its address is printed. Raises ConfigError."""
     from aftbed.report import live_page  # noqa: PLC0415 - only with --web
 
     listener, token = live_page.listen(given.port), live_page.new_token()
@@ -422,7 +429,7 @@ def _page(given: RunArguments) -> Callable[[Path], AbstractContextManager[None]]
         import webbrowser  # noqa: PLC0415 - only with --open
 
         webbrowser.open(shown)
-    return lambda private: live_page.beside(listener, private, token)
+    return live_page.beside(listener, private, token)
 
 
 # -- while it runs --------------------------------------------------------------------------------
