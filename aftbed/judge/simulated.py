@@ -9,6 +9,7 @@ import msgspec
 from aftbed.core.application import Application, close
 from aftbed.core.errors import FUNCTION_FAILED
 from aftbed.core.events import Event
+from aftbed.core.graph import STAGED
 from aftbed.core.script import ScriptKind
 from aftbed.ftm.compose import detects, replication_of
 from aftbed.functions.load import NO_CODE, Code
@@ -84,7 +85,9 @@ def service_struck_down(run: Run) -> bool:
         for s in run.scripts
         if s.kind is ScriptKind.NEW_BACKUP and s.ended_ns and not s.failure
     ]
-    strikes = sorted((t_ns, replica_of(name)) for t_ns, name in run.struck if replica_of(name))
+    # What is staged, and what was exchanged and may have to come back, is a part of its replica.
+    named = sorted((t_ns, replica_of(name.removesuffix(STAGED))) for t_ns, name in run.struck)
+    strikes = [(t_ns, replica) for t_ns, replica in named if replica]
     if any(name == SINGLE for _, name in run.struck):
         return True
     simplex = any(a.goal.expression and not replication_of(a.goal.expression) for a in run.setup.adaptations)

@@ -209,13 +209,13 @@ def _request_events(ftm: str, placement: str) -> tuple[Event, ...]:
 
 @lru_cache(maxsize=128)
 def _channels(ftm: str, placement: str) -> tuple[str, ...]:
-    """Those on which the replica that leads sends at each request, but that from After to the backup.
+    """Those on which the replica that leads sends at each request, but those to the backup.
 
     What is held back there dies with its sender, when the reply has gone: two faults, and two replicas
     that differ.
     """
     graph = graph_of(ftm, placement)
-    left_out = {port for part, port in replication_of(ftm) if part == "after"}
+    left_out = {port for _, port in replication_of(ftm)}
     names = sorted({link.name for link in graph.links} - left_out - set(ON_DEMAND))
     faults = {
         name: Fault(ChannelFault(Disturbance.DELAY, name), targets.PRIMARY, Trigger()) for name in names

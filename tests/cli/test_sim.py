@@ -613,3 +613,12 @@ def test_options_that_are_refused(
 ) -> None:
     error = refused("sim", *arguments)
     assert all(word in error for word in words), error
+
+
+def test_a_replica_is_struck_too_where_its_exchanged_process_dies(sim: Call) -> None:
+    """Behind the exchange, the new process of one replica dies and the old one of the other: none is whole."""
+    at = "at adapt.step.act nth 8"
+    faults = ("--inject", f"crash b' {at}", "--inject", f"crash primary {at}")
+    run = ("--seed", "6496", "--ftm", "pbr", "--placement", "replica", "--count", "1")
+    code, out, _ = sim(*run, *faults, "--adapt", "to lfr+tr at request 1")
+    assert code == 3 and "exactly_one_answer pass" in out, out
