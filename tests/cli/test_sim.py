@@ -616,7 +616,7 @@ def test_options_that_are_refused(
 
 
 def test_a_replica_is_struck_too_where_its_exchanged_process_dies(sim: Call) -> None:
-    """Behind the exchange, the new process of one replica dies, and the old one of the other: both are struck."""
+    """Behind an exchange the new process of one replica dies, and the old one of the other."""
     at = "at adapt.step.act nth 8"
     faults = ("--inject", f"crash b' {at}", "--inject", f"crash primary {at}")
     run = ("--seed", "6496", "--ftm", "pbr", "--placement", "replica", "--count", "1")
