@@ -173,6 +173,8 @@ def test_a_stopped_node_is_seen_alive_when_it_goes_on(tmp_path: Path) -> None:
 
 def test_a_stop_is_noticed_by_the_next_look_whatever_the_node_did_before(tmp_path: Path) -> None:
     with node_process(tmp_path) as node:
+        node.ask(PASS)
+        node.asleep()
         assert all(looks(node))
         node.ask(PASS)
         node.asleep()
