@@ -43,10 +43,15 @@ def trail(mechanisms: tuple[str, ...]) -> list[str]:
 
 def adapt(run: Started, goal: Goal) -> dict[str, object]:
     """The answer of the run; asked again where a busy machine gave the adaptation no time."""
-    for _ in range(ADAPT_TRIES):
-        found = control_client.ask(
-            run.private, control_client.AdaptCommand(goal), control_client.ADAPT_SECONDS_MAX
-        )
+    for tries_left in reversed(range(ADAPT_TRIES)):
+        try:
+            found = control_client.ask(
+                run.private, control_client.AdaptCommand(goal), control_client.ADAPT_SECONDS_MAX
+            )
+        except ConfigError as refusal:
+            if NO_TIME not in str(refusal) or not tries_left:
+                raise
+            found = {"reason": str(refusal)}
         if NO_TIME not in str(found["reason"]):
             break
         until(lambda: not run.status()["busy"], "the end of what followed")

@@ -73,7 +73,8 @@ def how_it_ended(run: Started, goal: Goal) -> str:
     """`done`, `rolled back`, or `refused` where the Engine died before it had planned."""
     try:
         return str(adapt(run, goal)["outcome"])
-    except ConfigError:
+    except ConfigError as refusal:
+        print(refusal)  # pytest shows it where a test fails
         return "refused"
 
 
