@@ -50,7 +50,7 @@ from aftbed.functions.source import located
 from aftbed.inject.memory import refuse_unsafe
 from aftbed.inject.model import Fault, parse
 from aftbed.runtime.control import Report
-from aftbed.runtime.unix.launch import Launched, launch, options_for
+from aftbed.runtime.unix.launch import Launched, launch, listen_on_loopback, options_for
 from aftbed.runtime.unix.options import CarRun, LoadRun, PolicyOptions, ReplayRun, Work, ftti_ms_of
 
 if TYPE_CHECKING:
@@ -422,7 +422,7 @@ def _page(given: RunArguments, private: Path) -> AbstractContextManager[None]:
     """What serves the page of the run in `private`; its address is printed. Raises ConfigError."""
     from aftbed.report import live_page  # noqa: PLC0415 - only with --web
 
-    listener, token = live_page.listen(given.port), live_page.new_token()
+    listener, token = listen_on_loopback(given.port, "--port"), live_page.new_token()
     shown = live_page.address(listener, token)
     print(f"page: {shown}", file=sys.stderr, flush=True)
     if given.open_page:

@@ -8,6 +8,7 @@ import typer
 from aftbed.cli.options import Run, check_range
 from aftbed.report import live_page
 from aftbed.runtime.unix import run_directory
+from aftbed.runtime.unix.launch import listen_on_loopback
 
 Port = Annotated[int, typer.Option(help="TCP port of the page on 127.0.0.1; 0 is any free one.")]
 Open = Annotated[bool, typer.Option("--open", help="Open the page in the browser.")]
@@ -20,7 +21,7 @@ def web(run: Run = None, port: Port = 0, open_it: Open = False) -> None:
     """
     check_range("--port", port, 0, 65535)
     private = run_directory.find(run)
-    listener, token = live_page.listen(port), live_page.new_token()
+    listener, token = listen_on_loopback(port, "--port"), live_page.new_token()
     shown = live_page.address(listener, token)
     print(f"run {private.name}: {shown}", flush=True)
     if open_it:

@@ -14,7 +14,7 @@ A Watchdog sees none of this: a brick that waits for a lost message is alive, an
 violation ends the node, as a failed assertion does: a detected stop. Under a duplex the Watchdog then sees a
 death, and Recovery fences the replica. No reply leaves that is out of order or late.
 
-The deadline is `LENIENT_NS` in a follower, for whose reply nobody waits, and in a replica that has taken over
+The deadline is `LENIENT_NS` in a follower, whose reply no client waits for, and in a replica that has taken over
 no longer ago than that: until it has a backup, a late reply is better than none. So a machine that stands
 still does not end both.
 

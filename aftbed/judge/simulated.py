@@ -88,11 +88,14 @@ def service_struck_down(run: Run) -> bool:
     # What is staged, and what was exchanged and may have to come back, is a part of its replica.
     named = sorted((t_ns, replica_of(name.removesuffix(STAGED))) for t_ns, name in run.struck)
     strikes = [(t_ns, replica) for t_ns, replica in named if replica]
-    if any(name == SINGLE for _, name in run.struck):
+    # Supervision stops what a fault has made late. Where there is another replica, that one has to serve.
+    late = supervised(run) and bool(run.setup.faults)
+    stopped = [r.node for r in run.history.events(Event.DETECTED_STOP)] if late else []
+    if SINGLE in (*(name for _, name in run.struck), *stopped):
         return True
     simplex = any(a.goal.expression and not replication_of(a.goal.expression) for a in run.setup.adaptations)
     if len(replicas) < 2 or simplex:  # for a time there may have been one replica only
-        return bool(strikes)
+        return bool(strikes or stopped)
     return any(
         other != replica and not any(first_ns < began and done < second_ns for began, done in renewed)
         for (first_ns, replica), (second_ns, other) in itertools.combinations(strikes, 2)
@@ -121,11 +124,15 @@ def breaches(
     return (*broken(evidence_of_run(run, code, function)), *needless_stops(run))
 
 
+def supervised(run: Run) -> bool:
+    """Whether a mechanism ran, or was tried, that stops a replica for a late step."""
+    hosted = (run.setup.ftm, *(one.tried_ftm or one.ftm for one in run.adaptations))
+    return any(detects(ftm, "flow") for ftm in hosted)
+
+
 def needless_stops(run: Run) -> tuple[Breach, ...]:
     """A brick that stopped itself, though nothing that it was given can have been altered, or was late."""
-    hosted = (run.setup.ftm, *(one.tried_ftm or one.ftm for one in run.adaptations))
-    timed = any(detects(ftm, "flow") for ftm in hosted)  # what delays a step may stop it: a fault, a failover
-    if timed and (run.setup.faults or run.history.events(Event.WATCHDOG_SUSPECT)):
+    if supervised(run) and (run.setup.faults or run.history.events(Event.WATCHDOG_SUSPECT)):
         return ()
     if not all(isinstance(fault.action, HARMLESS) for fault in run.setup.faults):
         return ()

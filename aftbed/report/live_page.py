@@ -49,6 +49,7 @@ HOST: Final = "127.0.0.1"
 PERIOD_S: Final = 0.1  # between two snapshots
 IDLE_S: Final = 0.4  # between two looks whether the run lives, while there is no page
 START_S_MAX: Final = 10.0  # from the start of the run to its first answer
+LAST_S_MAX: Final = 0.2  # that the pages may take to read the end
 END_S_MAX: Final = 0.8  # from the end of the run to that of the server
 CONNECTIONS_MAX: Final = 16
 COMMANDS_MAX: Final = 2  # at once
@@ -171,7 +172,7 @@ class RunWatcher:
             while True:
                 with self._changed:
                     while not self._ended and self._number <= number:
-                        self._changed.wait()
+                        self._changed.wait(SEND_S_MAX)
                     if self._ended or self._now is None:
                         return
                     new = min(self._events_seen - seen, len(self._events))
@@ -211,15 +212,19 @@ class PageServer(ThreadingHTTPServer):
             self._room.release()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """A browser that went away, or did not read, is no trouble of the run."""
+        """A browser that went away, or did not read, is no trouble; anything else is printed."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)  # type: ignore[arg-type]
 
     def serve_until_the_end(self) -> None:
         """Serve until the run has ended."""
         serving = threading.Thread(target=self.serve_forever, args=(PERIOD_S,), daemon=True)
         serving.start()
         self.watcher.run()
-        time.sleep(PERIOD_S)  # the pages are sent the end
         self.shutdown()
+        limit_s = time.monotonic() + LAST_S_MAX
+        for _ in range(CONNECTIONS_MAX):  # each page has been sent the end
+            self._room.acquire(timeout=max(0.0, limit_s - time.monotonic()))
         self.server_close()
 
     def refusal(self, handler: "PageRequest") -> str:
@@ -334,19 +339,6 @@ def carry_out(words: str, private: Path, at_once: threading.Semaphore) -> tuple[
 
 
 # -- how it is started --------------------------------------------------------------------------------
-
-
-def listen(port: int) -> socket.socket:
-    """A socket that listens on the loopback; 0 is any free port. Raises ConfigError if it is in use."""
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind((HOST, port))
-        listener.listen(CONNECTIONS_MAX)
-    except OSError as error:
-        listener.close()
-        raise ConfigError(f"--port {port}: {error.strerror}; choose another, or 0 for any free one") from None
-    return listener
 
 
 def new_token() -> str:

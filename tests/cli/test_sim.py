@@ -622,3 +622,15 @@ def test_a_replica_is_struck_too_where_its_exchanged_process_dies(sim: Call) -> 
     run = ("--seed", "6496", "--ftm", "pbr", "--placement", "replica", "--count", "1")
     code, out, _ = sim(*run, *faults, "--adapt", "to lfr+tr at request 1")
     assert code == 3 and "exactly_one_answer pass" in out, out
+
+
+@pytest.mark.parametrize("placement", ["process", "single"])
+def test_a_stop_by_supervision_that_a_fault_has_caused_is_no_loss_without_a_cause(
+    sim: Call, placement: str
+) -> None:
+    slow = ("--inject", "slow primary by 30ms at server.enter nth 10", "--count", "40")
+    code, out, _ = sim("--ftm", "sup", "--placement", placement, *slow)
+    assert code == 0 and "outcome: unavailable" in out and "exactly_one_answer unknown" in out, out
+    twice = ("--inject", "duplicate pro2bfr nth 5", "--count", "40")  # it stops both: nothing excuses that
+    code, out, _ = sim("--ftm", "lfr+sup", *twice)
+    assert code == 1 and "the service is lost, though no node was struck" in out, out

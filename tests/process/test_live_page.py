@@ -1,4 +1,4 @@
-"""The live page of a run: what it shows, what its buttons do, and who does not get it."""
+"""The live page of a run: what it shows, what its buttons do, and which requests are refused."""
 
 import http.client
 import json

@@ -5,7 +5,7 @@ import socket
 import pytest
 
 from aftbed.core.errors import ConfigError
-from aftbed.runtime.unix.launch import bind_hub
+from aftbed.runtime.unix.launch import listen_on_loopback
 from aftbed.vehicle.can.bus import HOST
 
 TEST_NET: str = "192.0.2.1"  # RFC 5737: it is not assigned; nothing is sent there
@@ -24,7 +24,7 @@ def own_addresses() -> list[str]:
 
 @pytest.mark.parametrize("address", own_addresses())
 def test_the_bus_is_not_reached_by_another_address(address: str) -> None:
-    with bind_hub(0) as listener:
+    with listen_on_loopback(0, "--bus-port") as listener:
         host, port = listener.getsockname()
         assert host == HOST == "127.0.0.1"
         with pytest.raises(ConnectionRefusedError):
@@ -33,7 +33,7 @@ def test_the_bus_is_not_reached_by_another_address(address: str) -> None:
 
 
 def test_a_port_that_is_taken_is_said_to_be() -> None:
-    with bind_hub(0) as listener:
+    with listen_on_loopback(0, "--bus-port") as listener:
         port = listener.getsockname()[1]
         with pytest.raises(ConfigError, match=f"--bus-port {port}: Address already in use; choose another"):
-            bind_hub(port)
+            listen_on_loopback(port, "--bus-port")

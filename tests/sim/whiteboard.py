@@ -168,7 +168,7 @@ class Whiteboard(World):
             bit = fault_and_bits(record.detail)[1]
             if record.request_id and isinstance(self._armed.action, ChannelFault):
                 self.say(record.node, f"is struck by {self._armed}")
-            elif record.request_id:  # who strikes itself is seen to die
+            elif record.request_id:  # a node that strikes itself is seen to die
                 self.say(record.node, f"bit {bit} flips in what it makes of {record.request_id}")
         elif record.event is Event.VOTE_COMPARED:
             self.say(record.node, f"votes on {record.request_id}: {VOTES[record.detail]}")

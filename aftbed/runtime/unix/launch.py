@@ -72,8 +72,11 @@ def ensure_limits() -> None:
         )
 
 
-def bind_hub(port: int) -> socket.socket:
-    """The hub's listening socket on the loopback; `port` 0 is any. Raises ConfigError if it is in use."""
+def listen_on_loopback(port: int, option: str) -> socket.socket:
+    """A listening socket on 127.0.0.1; `port`, the value of `option`, may be 0 for any free one.
+
+    Raises ConfigError if it is in use.
+    """
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -82,7 +85,7 @@ def bind_hub(port: int) -> socket.socket:
     except OSError as error:
         sock.close()
         raise ConfigError(
-            f"--bus-port {port}: {error.strerror}; choose another, or 0 for any free one"
+            f"{option} {port}: {error.strerror}; choose another, or 0 for any free one"
         ) from None
     return sock
 
@@ -347,7 +350,7 @@ def options_for(
     drive = _scenario(work) if isinstance(work, CarRun) else None
     verifies = tuple(dict.fromkeys((*verifies, *(drive.verifies if drive is not None else ()))))
     ensure_limits()
-    listener = None if isinstance(work, LoadRun) else bind_hub(bus_port)
+    listener = None if isinstance(work, LoadRun) else listen_on_loopback(bus_port, "--bus-port")
     try:
         private = run_directory.free()
         directory = private / "record" if record is None else run_directory.record_directory(Path(record))
