@@ -14,9 +14,9 @@ A Watchdog sees none of this: a brick that waits for a lost message is alive, an
 violation ends the node, as a failed assertion does: a detected stop. Under a duplex the Watchdog then sees a
 death, and Recovery fences the replica. No reply leaves that is out of order or late.
 
-The deadline is `LENIENT_NS` in a follower, whose reply no client waits for, and in a replica that has taken over
-no longer ago than that: until it has a backup, a late reply is better than none. So a machine that stands
-still does not end both.
+The deadline is `LENIENT_NS` in a follower, whose reply nothing waits for, and in a replica that has taken
+over no longer ago than that: until it has a backup, a late reply is better than none. So a machine that
+stands still does not end both.
 
 Limits: what happens outside of Before and After, as the checkpoint of an outer PBR, is not seen; a request
 that comes from there twice is. A second execution is noticed by its reply, with the next request: the state
