@@ -66,8 +66,9 @@ def test_what_a_stopped_supervisor_stopped_is_thawed_by_the_warden_in_time(home:
         assert entries(run)[1] == cleanup.Undone(pid, linux.started(pid), "warden")
         run.strike("supervisor", signal.SIGCONT)
         assert run.pid("engine") == pid
-        told = (run.launched.record / "events.jsonl").read_text()
-        assert f"by the warden: engine ({pid}), stopped" in told
+        events = run.launched.record / "events.jsonl"
+        told = f"by the warden: engine ({pid}), stopped"  # written behind the ledger
+        until(lambda: told in events.read_text(), "the event of it")
         assert run.stop().verdict.verdict == "pass"
 
 
