@@ -44,7 +44,7 @@ from aftbed.core.graph import PLACEMENTS
 from aftbed.core.requirements import check_requirements
 from aftbed.core.script import RECIPES
 from aftbed.core.yaml_file import read_yaml
-from aftbed.ftm.compose import EXPRESSIONS
+from aftbed.ftm.compose import expressions, is_listed
 from aftbed.functions.request_file import located_requests
 from aftbed.functions.source import located
 from aftbed.judge.outcome import OUTCOMES
@@ -233,7 +233,9 @@ def shipped() -> list[str]:
 def check(spec: Spec) -> None:
     """Check what the types do not express. Raises ConfigError naming the key."""
     if spec.mechanisms != (SUITABLE,):
-        _each_known("mechanisms", spec.mechanisms, (*EXPRESSIONS, SUITABLE))
+        for name in spec.mechanisms:
+            if name != SUITABLE and not is_listed(name):
+                raise ConfigError(f"mechanisms: {unknown('name', name, (*expressions(), SUITABLE))}")
         if SUITABLE in spec.mechanisms:
             raise ConfigError(f"mechanisms: {SUITABLE!r} stands alone: they are all that suit the function")
     _each_known("sometimes", spec.sometimes, tuple(state.value for state in RunState))
@@ -272,7 +274,7 @@ def check(spec: Spec) -> None:
 
 def mechanisms_of(spec: Spec) -> tuple[str, ...]:
     """Those that may be named in entries."""
-    return EXPRESSIONS if spec.mechanisms == (SUITABLE,) else spec.mechanisms
+    return expressions() if spec.mechanisms == (SUITABLE,) else spec.mechanisms
 
 
 def means(patterns: tuple[str, ...], name: str) -> bool:

@@ -11,7 +11,7 @@ import pytest
 from command_line import PLUGIN, called
 from sampling import every
 
-from aftbed.cli.new_function import KINDS, create
+from aftbed.cli.init import KINDS, create
 from aftbed.core.errors import ConfigError
 
 

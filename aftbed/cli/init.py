@@ -1,0 +1,281 @@
+"""`aftbed init KIND [NAME]`: a file or a project to begin with. It works as it is and says what to try next.
+
+Nothing is overwritten. Beside a YAML file its schema is put into `.aftbed/`, and the first line of the file
+names it: an editor with a YAML language server then completes its keys. The schema is rewritten by each
+`init`; the path to it is relative, so both can be moved or committed together.
+"""
+
+import contextlib
+import re
+import shlex
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Final, NamedTuple
+
+import typer
+
+from aftbed import functions
+from aftbed.cli.parsing import PlainGroup
+from aftbed.core.errors import ConfigError, unknown
+
+FILE_TEMPLATES: Final = Path(__file__).with_name("templates")
+SCHEMA_FOLDER: Final = ".aftbed"
+FILE_NAME: Final = re.compile(r"[a-z0-9][a-z0-9-]{0,40}")  # of a campaign, too
+MECHANISM_NAME: Final = re.compile(r"[a-z][a-z0-9]{0,19}")
+
+init = typer.Typer(cls=PlainGroup)
+
+To = Annotated[Path | None, typer.Option("--to", help="Where to write it; NAME.yaml here if left out.")]
+ToFolder = Annotated[Path | None, typer.Option("--to", help="The new directory.")]
+
+
+# -- one file -------------------------------------------------------------------------------------
+
+
+class FileKind(NamedTuple):
+    """`about`: what it is. `others`: files that it needs beside it, by their ending. `next`: what to run."""
+
+    about: str
+    next: str
+    others: tuple[str, ...] = ()
+
+
+FILES: Final = {
+    "scenario": FileKind("a drive", "aftbed run --scenario @FILE@ --pace max"),
+    "campaign": FileKind("many experiments and their gates", "aftbed campaign run @FILE@ --out @NAME@"),
+    "map": FileKind(
+        "how a radar reports its targets, with a log of one",
+        "aftbed run --replay @LOG@ --dbc ars408-like --map @FILE@ --pace max",
+        (".log",),
+    ),
+    "policy": FileKind("when which mechanism is adapted", "aftbed run --policy @FILE@ --load 800@400"),
+    "script": FileKind(
+        "an adaptation, step by step", "aftbed run --ftm pbr --load 3000@100 & aftbed adapt script @FILE@"
+    ),
+}
+
+
+def _file_command(kind: str) -> None:
+    about, default = FILES[kind].about, f"my-{kind}"
+
+    @init.command(kind, help=f"Write a {kind} file: {about}.")
+    def command(
+        name: Annotated[str, typer.Argument(help="Of the file, without its ending.")] = default, to: To = None
+    ) -> None:
+        path, words = write_file(kind, name, to)
+        for one in (path, *(path.with_suffix(ending) for ending in FILES[kind].others)):
+            typer.echo(f"{one}: written")
+        typer.echo(f"next: {_filled(FILES[kind].next, words)}")
+
+
+for _kind in FILES:
+    _file_command(_kind)
+
+
+def write_file(kind: str, name: str, to: Path | None) -> tuple[Path, dict[str, str]]:
+    """The new file, and the words of its template. Raises ConfigError, leaving nothing new of it."""
+    from aftbed.cli.schema import schema_text  # noqa: PLC0415 - of files only
+
+    if to is not None:
+        name = to.stem
+    if not FILE_NAME.fullmatch(name):
+        raise ConfigError(
+            f"{name[:60]!r} is no name of a file: small letters, digits and '-' are allowed, 41 at most"
+        )
+    path = to or Path(f"{name}.yaml")
+    if path.suffix not in (".yaml", ".yml"):
+        raise ConfigError(f"--to {path}: a file .yaml or .yml is allowed")
+    place = f"{SCHEMA_FOLDER}/{kind}.schema.json"
+    words = {
+        "NAME": name,
+        "FILE": shlex.quote(str(path)),
+        "LOG": shlex.quote(str(path.with_suffix(".log"))),
+        "SCHEMA": f"# yaml-language-server: $schema={place}",
+    }
+    endings = (".yaml", *FILES[kind].others)
+    content = {
+        path if ending == ".yaml" else path.with_suffix(ending): _filled(
+            (FILE_TEMPLATES / f"{kind}{ending}{SUFFIX}").read_text(), words
+        )
+        for ending in endings
+    }
+    with contextlib.ExitStack() as undo:
+        for file, text in content.items():
+            _write_new(file, text)
+            undo.callback(file.unlink, missing_ok=True)
+        schema = path.parent / place
+        try:
+            schema.parent.mkdir(exist_ok=True)
+            schema.write_text(schema_text(kind) + "\n")
+        except OSError as error:
+            raise ConfigError(f"{schema}: cannot be written: {error.strerror}") from None
+        undo.pop_all()
+    return path, words
+
+
+def _write_new(file: Path, text: str) -> None:
+    try:
+        with file.open("x") as sink:
+            sink.write(text)
+    except FileExistsError:
+        raise ConfigError(f"{file}: is there already; choose another name, or --to FILE") from None
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be written: {error.strerror}") from None
+
+
+# -- the package of a mechanism -------------------------------------------------------------------
+
+MECHANISM_FILES: Final = {
+    "README.md": "README.md",
+    "pyproject.toml": "pyproject.toml",
+    "aftbed_@NAME@/__init__.py": "mechanism.py",
+    "test_@NAME@.py": "test_mechanism.py",
+}
+
+
+@init.command()
+def mechanism(
+    name: Annotated[str, typer.Argument(help="Of the mechanism, as --ftm takes it.")] = "limit",
+    to: ToFolder = None,
+) -> None:
+    """Write a Python package with a mechanism: its brick, its declaration, tests, the entry point."""
+    folder = write_mechanism(name, to)
+    typer.echo(f"{folder}/: {', '.join(sorted(file.replace('@NAME@', name) for file in MECHANISM_FILES))}")
+    typer.echo(f"next: cd {shlex.quote(str(folder))} && pip install -e . && pytest")
+
+
+def write_mechanism(name: str, to: Path | None) -> Path:
+    """The new directory. Raises ConfigError, leaving nothing."""
+    from aftbed.ftm import registry  # noqa: PLC0415 - of a mechanism only
+
+    if not MECHANISM_NAME.fullmatch(name) or name in registry.RESERVED:
+        raise ConfigError(
+            f"{name[:60]!r} is no name of a mechanism: a small letter, then up to 19 small letters and"
+            " digits are allowed"
+        )
+    if name in registry.names():
+        raise ConfigError(f"there is a mechanism {name} already; choose another name: aftbed ftm list")
+    content = {
+        file.replace("@NAME@", name): _filled(
+            (FILE_TEMPLATES / "mechanism" / f"{template}{SUFFIX}").read_text(), {"NAME": name}
+        )
+        for file, template in MECHANISM_FILES.items()
+    }
+    return write_folder(to or Path(f"aftbed-{name}"), content)
+
+
+# -- the project of a function --------------------------------------------------------------------
+
+NAME: Final = re.compile(r"[a-z][a-z0-9-]{0,39}")
+TEMPLATES: Final = Path(functions.__file__).parent / "templates"
+SUFFIX: Final = ".tmpl"  # so none is a module of this package; other files are copied
+EVERY_KIND: Final = {  # file of a project: its template
+    "README.md": "all/README.md.tmpl",
+    "requests.csv": "all/requests.csv.tmpl",
+    "test_function.py": "all/test_function.py.tmpl",
+    "campaign.yaml": "all/campaign.yaml.tmpl",
+    ".github/workflows/test.yml": "all/workflow.yml.tmpl",
+}
+
+
+class ProjectKind(NamedTuple):
+    """`app`: what `--app` takes in the project. `first`: the command that makes it, and `needs` what pip has
+    to install for it; "" for none.
+    """
+
+    app: str
+    source: str
+    files: dict[str, str]
+    first: str = ""
+    needs: str = ""
+
+
+KINDS: Final = {
+    "class": ProjectKind("function.py:Function", "function.py", {"function.py": "class/function.py.tmpl"}),
+    "so": ProjectKind(
+        "function.so",
+        "function.c",
+        {"function.c": "so/function.c.tmpl", "Makefile": "so/Makefile.tmpl", "aft.h": "../aft.h"},
+        first="make",
+    ),
+    "fmu": ProjectKind(
+        "function.fmu",
+        "function.c",
+        {
+            name: f"fmu/{name}.tmpl"
+            for name in ("function.c", "modelDescription.xml", "ports.yaml", "Makefile")
+        },
+        first="make",
+        needs="FMPy",
+    ),
+    "stdio": ProjectKind("python3 function.py", "function.py", {"function.py": "stdio/function.py.tmpl"}),
+}
+
+
+@init.command("function")
+def new(
+    name: Annotated[str, typer.Argument(help="Of the project, and of its new directory.")],
+    kind: Annotated[str, typer.Option(help=f"What the function is: {', '.join(KINDS)}.")] = "class",
+    to: ToFolder = None,
+) -> None:
+    """Write a project with a function, its requests, tests, a campaign and a CI workflow."""
+    folder = create(name, kind, to)
+    first = f"{KINDS[kind].first} && " if KINDS[kind].first else ""
+    typer.echo(f"{folder}/: {', '.join(sorted(_files(kind)))}")
+    typer.echo(f"next: cd {shlex.quote(str(folder))} && {first}pytest")
+
+
+def create(name: str, kind: str, to: Path | None = None) -> Path:
+    """The new directory. Raises ConfigError, leaving nothing."""
+    if kind not in KINDS:
+        raise unknown("kind", kind, KINDS)
+    if not NAME.fullmatch(name):
+        raise ConfigError(
+            f"{name[:60]!r} is no name of a project: a small letter, then up to 39 small letters, digits"
+            " and '-' are allowed"
+        )
+    words = {
+        "NAME": name,
+        "APP": KINDS[kind].app,
+        "SOURCE": KINDS[kind].source,
+        "FIRST": f"{KINDS[kind].first} && " if KINDS[kind].first else "",
+        "NEEDS": f" {KINDS[kind].needs}" if KINDS[kind].needs else "",
+    }
+    content = {}
+    for file, template in _files(kind).items():
+        text = (TEMPLATES / template).read_text()
+        content[file] = _filled(text, words) if template.endswith(SUFFIX) else text
+    return write_folder(to or Path(name), content)
+
+
+def _files(kind: str) -> dict[str, str]:
+    return EVERY_KIND | KINDS[kind].files
+
+
+# -- writing --------------------------------------------------------------------------------------
+
+
+def write_folder(folder: Path, content: Mapping[str, str]) -> Path:
+    """A new directory with these files. Raises ConfigError, leaving nothing."""
+    try:
+        folder.mkdir()
+    except FileExistsError:
+        raise ConfigError(f"{folder}: is there already; a new directory is allowed") from None
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be made: {error.strerror}") from None
+    with contextlib.ExitStack() as undo:
+        undo.callback(shutil.rmtree, folder, ignore_errors=True)
+        try:
+            for file, text in content.items():
+                path = folder / file
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(text)
+        except OSError as error:
+            raise ConfigError(f"{folder}: cannot be written: {error.strerror}") from None
+        undo.pop_all()
+    return folder
+
+
+def _filled(template: str, words: Mapping[str, str]) -> str:
+    return re.sub(r"@([A-Z]+)@", lambda found: words[found[1]], template)
