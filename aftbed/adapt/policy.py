@@ -68,30 +68,30 @@ TOO_NEAR: Final = "both can hold at once, or next to each other; there must be a
 class When(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A condition, key by key; which keys go together is checked by `policy_from`."""
 
-    event: Symptom | None = None
-    count: Annotated[int, Meta(ge=1, le=COUNT_MAX)] | None = None
-    within_s: Seconds | None = None
-    quiet_s: Seconds | None = None
-    resource: Resource | None = None
-    above: Value | None = None
-    below: Value | None = None
-    until: Value | None = None
-    for_s: Annotated[float, Meta(ge=0, le=86_400)] | None = None
+    event: Symptom | None = None  # a symptom; with count and within_s, or with quiet_s
+    count: Annotated[int, Meta(ge=1, le=COUNT_MAX)] | None = None  # so many of the event
+    within_s: Seconds | None = None  # in so long
+    quiet_s: Seconds | None = None  # none of the event for so long
+    resource: Resource | None = None  # with above or below
+    above: Value | None = None  # it begins at more than this
+    below: Value | None = None  # it begins at less than this
+    until: Value | None = None  # it ends here; none: where it began
+    for_s: Annotated[float, Meta(ge=0, le=86_400)] | None = None  # so long without a break
 
 
 class RuleFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One rule of a file."""
 
-    when: When
-    then: str
+    when: When  # the condition
+    then: str  # to FTM, switch FTM, compose FTM, or decompose
 
 
 class PolicyFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A policy, key by key."""
 
-    dwell_s: Seconds
-    rules: tuple[RuleFile, ...]
-    description: str = ""
+    dwell_s: Seconds  # after an adaptation there is no other one for so long
+    rules: tuple[RuleFile, ...]  # the first one that holds decides
+    description: str = ""  # for people
 
 
 class Burst(msgspec.Struct, frozen=True):

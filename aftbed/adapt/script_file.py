@@ -93,12 +93,12 @@ STEP_SCHEMA: Final[dict[str, object]] = {
 class ScriptFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A script, key by key; what a step may be is checked by `script_from`."""
 
-    purpose: Annotated[str, Meta(min_length=1, max_length=200)]
-    commit: tuple[object, ...]
-    prepare: tuple[object, ...] = ()
-    finish: tuple[object, ...] = ()
-    ftm: str = ""
-    recipe: Literal["drained", "paper"] = "drained"
+    purpose: Annotated[str, Meta(min_length=1, max_length=200)]  # in a line, for people
+    commit: tuple[object, ...]  # steps while requests wait
+    prepare: tuple[object, ...] = ()  # steps beside what serves
+    finish: tuple[object, ...] = ()  # steps once requests are served again
+    ftm: str = ""  # the mechanism that it leads to; none: that which runs
+    recipe: Literal["drained", "paper"] = "drained"  # paper: SIGSTOP, kill, launch, link, SIGCONT
 
 
 # -- from a script to a file ----------------------------------------------------------------------

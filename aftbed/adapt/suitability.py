@@ -78,7 +78,7 @@ AMPLE: Final = Resources(cpus=1024)  # where R is not at stake
 class Row(Suitability, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What one mechanism tolerates and needs."""
 
-    mechanism: str
+    mechanism: str  # whose row it is
 
 
 class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -88,10 +88,10 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bandwidths carry 50 requests a second of the brake function: as requests (low), as states (high).
     """
 
-    low_cpu_load_max: Part = 0.9
-    high_cpu_load_max: Part = 0.5
-    low_bandwidth_kbit_s_min: Rate = 64.0
-    high_bandwidth_kbit_s_min: Rate = 256.0
+    low_cpu_load_max: Part = 0.9  # of a mechanism of low CPU load
+    high_cpu_load_max: Part = 0.5  # of one of high CPU load
+    low_bandwidth_kbit_s_min: Rate = 64.0  # of a mechanism of low bandwidth
+    high_bandwidth_kbit_s_min: Rate = 256.0  # of one of high bandwidth
 
 
 class SuitabilityTable(msgspec.Struct, frozen=True):
@@ -108,8 +108,8 @@ class SuitabilityTable(msgspec.Struct, frozen=True):
 class TableFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A user's file: each row takes the place of the shipped one for the same mechanism."""
 
-    rows: tuple[Row, ...] = ()
-    limits: Limits = Limits()
+    rows: tuple[Row, ...] = ()  # each takes the place of that of the same mechanism
+    limits: Limits = Limits()  # what the classes mean in numbers
 
 
 class Demand(msgspec.Struct, frozen=True):

@@ -28,7 +28,7 @@ SHAPES: Final = {  # kind of file: MODULE:TYPE below aftbed, what it is
 }
 DIALECT: Final = "http://json-schema.org/draft-07/schema#"  # what the YAML extension of VS Code knows best
 _FIELD: Final = re.compile(r" {4}(?P<key>\w+): [^#\n]*(?:# (?P<about>.*))?$")
-_MEANING: Final = re.compile(r"(?:^|[.;:] |\n)(?=(?:`\w+`, )*`\w+`: )")
+_MEANING: Final = re.compile(r"(?:^|[.;:] )(?=(?:`\w+`, )*`\w+`: )")
 
 Schema = dict[str, Any]
 
@@ -62,8 +62,9 @@ def schema_of(kind: str) -> Schema:
         from aftbed.adapt.script_file import STEP_SCHEMA  # noqa: PLC0415 - of this kind only
 
         parts["Step"] = STEP_SCHEMA
-    for one in _structs(shape):
+    for one in structs_of(shape):
         _describe(parts[one.__name__], one)
+    _to_draft_07(parts)
     return {"$schema": DIALECT, "title": f"aftbed {kind}", "definitions": parts, **top}
 
 
@@ -80,16 +81,16 @@ def _steps(kind: type) -> Schema:
     return {"$ref": "#/definitions/Step"}
 
 
-def _structs(kind: object, known: set[object] | None = None) -> Iterator[type[msgspec.Struct]]:
+def structs_of(kind: object, known: set[object] | None = None) -> Iterator[type[msgspec.Struct]]:
     """`kind` and all structs in it, each once."""
     known = set() if known is None else known
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct) and kind not in known:
         known.add(kind)
         yield kind
         for field in msgspec.structs.fields(kind):
-            yield from _structs(field.type, known)
+            yield from structs_of(field.type, known)
     for part in get_args(kind):
-        yield from _structs(part, known)
+        yield from structs_of(part, known)
 
 
 def _describe(part: Schema, kind: type[msgspec.Struct]) -> None:
@@ -99,6 +100,18 @@ def _describe(part: Schema, kind: type[msgspec.Struct]) -> None:
             part["properties"][key] = _with_meaning(part["properties"][key], about)
     if "description" in part:
         part["description"] = " ".join(part["description"].split())
+
+
+def _to_draft_07(part: object) -> None:
+    """msgspec writes a tuple of a fixed length in the words of a later draft."""
+    if isinstance(part, dict):
+        if "prefixItems" in part:
+            part["items"] = part.pop("prefixItems")
+            part["additionalItems"] = False
+        part = list(part.values())
+    if isinstance(part, list):
+        for inner in part:
+            _to_draft_07(inner)
 
 
 def _with_meaning(found: Schema, about: str) -> Schema:
@@ -113,8 +126,8 @@ def meanings(kind: type[msgspec.Struct]) -> dict[str, str]:
     """What each key of the struct means; a key of which the source says nothing is left out."""
     found: dict[str, str] = {}
     for one in reversed(kind.__mro__[: kind.__mro__.index(msgspec.Struct)]):
-        for sentence in _MEANING.split(inspect.cleandoc(one.__doc__ or "").split("\n\n", 1)[-1]):
-            keys, colon, about = " ".join(sentence.split()).partition("`: ")
+        for sentence in _MEANING.split(" ".join((one.__doc__ or "").split())):
+            keys, colon, about = sentence.partition("`: ")
             if colon and keys.startswith("`"):
                 found |= dict.fromkeys(re.findall(r"\w+", keys), about.rstrip(".") + ".")
         for line in inspect.getsource(one).splitlines():
