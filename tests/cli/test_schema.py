@@ -1,6 +1,8 @@
 """JSON schemas of the YAML kinds: what editors complete from says what the readers say."""
 
 import json
+import re
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +17,7 @@ from jsonschema import Draft7Validator
 import aftbed
 from aftbed.adapt.script_file import ScriptFile, script_from
 from aftbed.cli.init import FILES, write_file
-from aftbed.cli.schema import SHAPES, meanings, schema_of, shape_of, structs_of
+from aftbed.cli.schema import SHAPES, meanings, schema_of, schema_text, shape_of, structs_of
 from aftbed.core.errors import ConfigError
 from aftbed.core.yaml_file import read_yaml
 
@@ -39,13 +41,14 @@ request: [{type: f64, variable: u}, {type: u16, skip: true}]
 reply: [{type: f32, variable: y, max: 2}]
 step_s: 0.1
 start: {k: 1.5}
-characteristics: {deterministic: true, state_access: {approximate: {y: 0.1}}}
+characteristics: {deterministic: true, state_access: {approximate: 0.1}}
 """,
     "table": "{rows: [{mechanism: pbr, tolerates: [crash], cpus: 3}], limits: {low_cpu_load_max: 0.8}}",
 }
 VALIDATORS: Final = {kind: Draft7Validator(schema_of(kind)) for kind in SHAPES}
 
 
+@cache
 def good(kind: str) -> list[Any]:
     """The content of good files of the kind."""
     texts = [path.read_text() for path in SHIPPED.get(kind, ())] or [TEXTS[kind]]
@@ -76,10 +79,10 @@ def test_a_template_is_read_keeps_to_its_schema_and_names_it(
     path, _ = write_file(kind, "mine", None)
     first, *_ = path.read_text().splitlines()
     schema = json.loads((path.parent / first.removeprefix("# yaml-language-server: $schema=")).read_text())
-    assert schema == schema_of(kind)
+    assert schema == json.loads(schema_text(kind))
     assert not list(Draft7Validator(schema).iter_errors(yaml.safe_load(path.read_text())))
     read_yaml(path, shape_of(kind))
-    assert "@" not in path.read_text()
+    assert not re.search("@[A-Z]+@", path.read_text())
 
 
 def refused_by_reader(kind: str, content: object) -> bool:

@@ -1,9 +1,11 @@
 """Installed packages for tests: a directory on the path, with metadata as pip writes them."""
 
+import importlib
 import tomllib
 from pathlib import Path
 
 from aftbed.cli.init import write_mechanism
+from aftbed.core.installed import entry_points
 
 
 def install(site: Path, package: str, points: dict[str, str], **modules: str) -> None:
@@ -15,6 +17,8 @@ def install(site: Path, package: str, points: dict[str, str], **modules: str) ->
     (about / "entry_points.txt").write_text("[aftbed.mechanisms]\n" + "".join(lines))
     for module, text in modules.items():
         (site / f"{module}.py").write_text(text)
+    importlib.invalidate_caches()
+    entry_points.cache_clear()
 
 
 def install_new(site: Path, name: str, folder: Path) -> Path:
