@@ -1,4 +1,4 @@
-"""`aftbed app new`: what it writes, and that the project passes its own tests."""
+"""`aftbed init` and `app new`: what they write, that it works as it is, and that nothing is overwritten."""
 
 import resource
 import shutil
@@ -9,10 +9,20 @@ from pathlib import Path
 
 import pytest
 from command_line import PLUGIN, called
+from fakerun import Output
+from packages import install_new
 from sampling import every
 
-from aftbed.cli.init import KINDS, create
+from aftbed.adapt.policy import PolicyFile, policy_from
+from aftbed.adapt.script_check import refusals
+from aftbed.adapt.script_file import ScriptFile, script_from
+from aftbed.cli.init import FILES, KINDS, create, write_file
 from aftbed.core.errors import ConfigError
+from aftbed.core.messages import Goal, Scheduled
+from aftbed.core.yaml_file import read_yaml
+from aftbed.ftm.compose import build
+from aftbed.runtime.sim.world import Setup
+from aftbed.search.explore import attempt
 
 
 @pytest.fixture(autouse=True)
@@ -64,6 +74,93 @@ def test_of_a_project_that_cannot_be_written_nothing_is_left(here: Path) -> None
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, ignored)
     assert list(here.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_a_file_is_named_with_the_next_command_and_never_overwritten(
+    kind: str, here: Path, output: Output, refused: Output
+) -> None:
+    path = here / f"my-{kind}.yaml"
+    told = output("init", kind).splitlines()
+    assert told[0] == f"my-{kind}.yaml: written" and told[-1].startswith("next: aftbed ")
+    assert path.name in told[-1]
+    before = {one: one.read_bytes() for one in here.rglob("*") if one.is_file()}
+    assert f"my-{kind}.yaml: is there already; choose another name, or --to FILE" in refused("init", kind)
+    assert {one: one.read_bytes() for one in here.rglob("*") if one.is_file()} == before
+
+
+def test_a_file_goes_where_it_is_wanted_with_its_schema_beside_it(here: Path, output: Output) -> None:
+    (here / "a folder").mkdir()
+    told = output("init", "map", "--to", "a folder/radar.yaml")
+    assert {str(one.relative_to(here)) for one in here.rglob("*") if one.is_file()} == {
+        "a folder/radar.yaml",
+        "a folder/radar.log",
+        "a folder/.aftbed/map.schema.json",
+    }
+    assert "--replay 'a folder/radar.log' --dbc ars408-like --map 'a folder/radar.yaml'" in told
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("scenario", "../up"), "'../up' is no name of a file: small letters, digits and '-' are allowed"),
+        (("campaign", "A"), "'A' is no name of a file"),
+        (("policy", "--to", "mine.txt"), "--to mine.txt: a file .yaml or .yml is allowed"),
+        (
+            ("policy", "--to", "gone/mine.yaml"),
+            "gone/mine.yaml: cannot be written: No such file",
+        ),
+        (("mechanism", "Limit"), "'Limit' is no name of a mechanism: a small letter, then up to 19 small"),
+        (("mechanism", "none"), "'none' is no name of a mechanism"),
+        (("mechanism", "pbr"), "there is a mechanism pbr already; choose another name: aftbed ftm list"),
+        (("mechanism", "--to", "gone/limit"), "gone/limit: cannot be made: No such file or directory"),
+    ],
+)
+def test_what_cannot_be_written_is_refused_and_nothing_is_left(
+    words: tuple[str, ...], reason: str, here: Path, refused: Output
+) -> None:
+    assert reason in refused("init", *words)
+    assert list(here.iterdir()) == []
+
+
+def test_a_map_and_its_log_that_is_there_are_both_kept(here: Path, refused: Output) -> None:
+    (here / "my-map.log").write_text("mine")
+    assert "my-map.log: is there already" in refused("init", "map")
+    assert [one.name for one in here.iterdir()] == ["my-map.log"]
+
+
+def test_the_map_fits_its_log(here: Path, output: Output) -> None:
+    write_file("map", "mine", None)
+    assert "cycles  7: 7 with" in output(
+        "map", "check", "mine.yaml", "--dbc", "ars408-like", "--log", "mine.log"
+    )
+
+
+def test_the_policy_and_the_script_are_accepted_and_the_script_is_carried_out(here: Path) -> None:
+    write_file("policy", "mine", None)
+    write_file("script", "by-hand", None)
+    assert len(policy_from(read_yaml(Path("mine.yaml"), PolicyFile), "mine.yaml").rules) == 2
+    script = script_from(read_yaml(Path("by-hand.yaml"), ScriptFile), "by-hand.yaml")
+    assert refusals(build("pbr", "process"), script) == []
+    run, breaches = attempt(Setup("pbr", count=20, adaptations=(Scheduled(Goal(script=script), 5),)))
+    assert breaches == () and run is not None
+
+
+@pytest.mark.simulation
+def test_the_scenario_and_the_campaign_pass(here: Path, output: Output) -> None:
+    write_file("scenario", "drive", None)
+    write_file("campaign", "crashes", None)
+    assert "verdict: pass" in output("sim", "--scenario", "drive.yaml")
+    assert "gate: pass" in output("campaign", "run", "crashes.yaml", "--out", "out", "--jobs", "1")
+
+
+@pytest.mark.process
+def test_the_package_of_a_mechanism_passes_its_own_tests(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = install_new(here / "site", "limit", here / "aftbed-limit")
+    monkeypatch.setenv("PYTHONPATH", str(here / "site"))
+    done = called(sys.executable, "-m", "pytest", "-q", *PLUGIN, "-W", "error", folder=folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "4 passed" in done.stdout
 
 
 @pytest.mark.process
