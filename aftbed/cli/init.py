@@ -9,13 +9,14 @@ import contextlib
 import re
 import shlex
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple
 
 import typer
 
 from aftbed import functions
+from aftbed.cli.options import Json, print_json
 from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError, unknown
 
@@ -61,12 +62,13 @@ def _file_command(kind: str) -> None:
 
     @init.command(kind, help=f"Write a {kind} file: {about}.")
     def command(
-        name: Annotated[str, typer.Argument(help="Of the file, without its ending.")] = default, to: To = None
+        name: Annotated[str, typer.Argument(help="Of the file, without its ending.")] = default,
+        to: To = None,
+        json: Json = False,
     ) -> None:
         path, words = write_file(kind, name, to)
-        for one in (path, *(path.with_suffix(ending) for ending in FILES[kind].others)):
-            typer.echo(f"{one}: written")
-        typer.echo(f"next: {_filled(FILES[kind].next, words)}")
+        files = [path, *(path.with_suffix(ending) for ending in FILES[kind].others)]
+        _tell(map(str, files), _filled(FILES[kind].next, words), as_json=json)
 
 
 for _kind in FILES:
@@ -138,11 +140,12 @@ MECHANISM_FILES: Final = {
 def mechanism(
     name: Annotated[str, typer.Argument(help="Of the mechanism, as --ftm takes it.")] = "limit",
     to: ToFolder = None,
+    json: Json = False,
 ) -> None:
     """Write a Python package with a mechanism: its brick, its declaration, tests, the entry point."""
     folder = write_mechanism(name, to)
-    typer.echo(f"{folder}/: {', '.join(sorted(file.replace('@NAME@', name) for file in MECHANISM_FILES))}")
-    typer.echo(f"next: cd {shlex.quote(str(folder))} && pip install -e . && pytest")
+    files = (file.replace("@NAME@", name) for file in MECHANISM_FILES)
+    _tell(_below(folder, files), f"cd {shlex.quote(str(folder))} && pip install -e . && pytest", as_json=json)
 
 
 def write_mechanism(name: str, to: Path | None) -> Path:
@@ -218,12 +221,12 @@ def new(
     name: Annotated[str, typer.Argument(help="Of the project, and of its new directory.")],
     kind: Annotated[str, typer.Option(help=f"What the function is: {', '.join(KINDS)}.")] = "class",
     to: ToFolder = None,
+    json: Json = False,
 ) -> None:
     """Write a project with a function, its requests, tests, a campaign and a CI workflow."""
     folder = create(name, kind, to)
     first = f"{KINDS[kind].first} && " if KINDS[kind].first else ""
-    typer.echo(f"{folder}/: {', '.join(sorted(_files(kind)))}")
-    typer.echo(f"next: cd {shlex.quote(str(folder))} && {first}pytest")
+    _tell(_below(folder, _files(kind)), f"cd {shlex.quote(str(folder))} && {first}pytest", as_json=json)
 
 
 def create(name: str, kind: str, to: Path | None = None) -> Path:
@@ -254,6 +257,20 @@ def _files(kind: str) -> dict[str, str]:
 
 
 # -- writing --------------------------------------------------------------------------------------
+
+
+def _below(folder: Path, files: Iterable[str]) -> list[str]:
+    return [str(folder / file) for file in sorted(files)]
+
+
+def _tell(files: Iterable[str], following: str, *, as_json: bool) -> None:
+    """What was written, and the command to try next."""
+    if as_json:
+        print_json({"files": list(files), "next": following})
+        return
+    for file in files:
+        print(f"{file}: written")
+    print(f"next: {following}")
 
 
 def write_folder(folder: Path, content: Mapping[str, str]) -> Path:

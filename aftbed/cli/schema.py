@@ -7,7 +7,6 @@ key. Which keys go together, and which names exist, is checked when the file is 
 
 import importlib
 import inspect
-import json
 import re
 from collections.abc import Iterator
 from typing import Annotated, Any, Final, get_args
@@ -15,6 +14,7 @@ from typing import Annotated, Any, Final, get_args
 import msgspec
 import typer
 
+from aftbed.cli.options import Json, print_json
 from aftbed.core.errors import unknown
 
 SHAPES: Final = {  # kind of file: MODULE:TYPE below aftbed, what it is
@@ -36,9 +36,14 @@ Schema = dict[str, Any]
 KIND_HELP: Final = f"{', '.join(SHAPES)}; a list of them if left out."
 
 
-def schema(kind: Annotated[str | None, typer.Argument(help=KIND_HELP)] = None) -> None:
+def schema(
+    kind: Annotated[str | None, typer.Argument(help=KIND_HELP)] = None,
+    json: Json = False,
+) -> None:
     """Print the JSON Schema of a kind of YAML file, for editors that complete and check by it."""
-    if kind is None:
+    if kind is None and json:
+        print_json({"kinds": {name: about for name, (_, about) in SHAPES.items()}})
+    elif kind is None:
         for name, (_, about) in SHAPES.items():
             print(f"{name:<10} {about}")
     else:
@@ -47,7 +52,7 @@ def schema(kind: Annotated[str | None, typer.Argument(help=KIND_HELP)] = None) -
 
 def schema_text(kind: str) -> str:
     """The schema of the kind as a file has it. Raises ConfigError."""
-    return json.dumps(schema_of(kind), indent=1)
+    return msgspec.json.format(msgspec.json.encode(schema_of(kind)), indent=1).decode()
 
 
 def schema_of(kind: str) -> Schema:

@@ -1,5 +1,6 @@
 """`aftbed init` and `app new`: what they write, that it works as it is, and that nothing is overwritten."""
 
+import json
 import resource
 import shutil
 import signal
@@ -121,6 +122,12 @@ def test_what_cannot_be_written_is_refused_and_nothing_is_left(
 ) -> None:
     assert reason in refused("init", *words)
     assert list(here.iterdir()) == []
+
+
+def test_what_was_written_is_told_in_json(here: Path, output: Output) -> None:
+    told = json.loads(output("init", "map", "--json"))
+    assert told["files"] == ["my-map.yaml", "my-map.log"] and told["next"].startswith("aftbed run --replay")
+    assert all((here / one).is_file() for one in json.loads(output("init", "mechanism", "--json"))["files"])
 
 
 def test_a_map_and_its_log_that_is_there_are_both_kept(here: Path, refused: Output) -> None:

@@ -174,6 +174,7 @@ def test_a_step_of_a_script_is_what_its_reader_takes(step: object, allowed: bool
 def test_the_command_prints_it_and_a_list(output: Output) -> None:
     assert json.loads(output("schema", "map"))["title"] == "aftbed map"
     assert [line.split()[0] for line in output("schema").splitlines()] == list(SHAPES)
+    assert list(json.loads(output("schema", "--json"))["kinds"]) == list(SHAPES)
 
 
 def test_an_unknown_kind_is_refused(refused: Output) -> None:
