@@ -19,11 +19,11 @@ from aftbed import functions
 from aftbed.cli.options import Json, print_json
 from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError, unknown
+from aftbed.ftm import registry
 
 FILE_TEMPLATES: Final = Path(__file__).with_name("templates")
 SCHEMA_FOLDER: Final = ".aftbed"
 FILE_NAME: Final = re.compile(r"[a-z0-9][a-z0-9-]{0,40}")  # of a campaign, too
-MECHANISM_NAME: Final = re.compile(r"[a-z][a-z0-9]{0,19}")
 
 init = typer.Typer(cls=PlainGroup)
 
@@ -150,9 +150,7 @@ def mechanism(
 
 def write_mechanism(name: str, to: Path | None) -> Path:
     """The new directory. Raises ConfigError, leaving nothing."""
-    from aftbed.ftm import registry  # noqa: PLC0415 - of a mechanism only
-
-    if not MECHANISM_NAME.fullmatch(name) or name in registry.RESERVED:
+    if not registry.NAME.fullmatch(name) or name in registry.RESERVED:
         raise ConfigError(
             f"{name[:60]!r} is no name of a mechanism: a small letter, then up to 19 small letters and"
             " digits are allowed"

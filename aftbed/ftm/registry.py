@@ -67,13 +67,15 @@ def _bricks_of(mechanism: Mechanism) -> dict[str, BrickKind]:
 
 MECHANISMS: Final = dict(_SHIPPED)  # and those of installed packages that were asked for
 BRICKS: Final = KindTable[BrickKind](
-    {kind.name: kind for kind in (CLIENT, PROXY, PROTOCOL, INNER_PROTOCOL, PASS_BEFORE, COMPUTE, SERVER)}
-    | {BARE_SERVER.name: BARE_SERVER}
-    | {name: kind for one in _SHIPPED.values() for name, kind in _bricks_of(one).items()}
-    | {kind.name: kind for kind in (WATCHDOG, RECOVERY)}
+    (kind.name, kind)
+    for kind in (
+        *(CLIENT, PROXY, PROTOCOL, INNER_PROTOCOL, PASS_BEFORE, COMPUTE, SERVER, BARE_SERVER),
+        *(kind for one in MECHANISMS.values() for kind in _kinds_of(one)),
+        *(WATCHDOG, RECOVERY),
+    )
 )
 ENGINE: Final = Kind("engine", (), ())  # it plans adaptations, so it is made in `adapt`
-KINDS: Final = KindTable[Kind]({**BRICKS, ENGINE.name: ENGINE})
+KINDS: Final = KindTable[Kind](BRICKS | {ENGINE.name: ENGINE})
 
 
 def make(kind: str, setting: Setting) -> Brick:
@@ -136,6 +138,10 @@ def server_emits(graph: Graph, event: Event, *, backs_up: bool) -> bool:
 _unusable: Final[dict[str, ConfigError]] = {}
 
 
+def _points(name: str) -> list[EntryPoint]:
+    return [point for point in entry_points(GROUP) if point.name == name]
+
+
 def names() -> tuple[str, ...]:
     """Of all mechanisms, ours first. Packages are not imported for that."""
     return tuple(dict.fromkeys((*SHIPPED, *(point.name for point in entry_points(GROUP)))))
@@ -144,7 +150,7 @@ def names() -> tuple[str, ...]:
 def find(name: str) -> Mechanism | None:
     """The mechanism of that name. Raises ConfigError where the package that declares it cannot be used."""
     if name not in MECHANISMS:
-        points = [point for point in entry_points(GROUP) if point.name == name]
+        points = _points(name)
         if not points:
             return None
         if name in _unusable:
@@ -161,7 +167,7 @@ def load_installed() -> list[str]:
     """Find all mechanisms of installed packages; why some of them cannot be used, a sentence each."""
     found = []
     for name in dict.fromkeys(point.name for point in entry_points(GROUP)):
-        points = [point for point in entry_points(GROUP) if point.name == name]
+        points = _points(name)
         try:
             if name in SHIPPED:
                 raise unusable(name, points, f"aftbed has a mechanism {name} of its own, which is used")
@@ -200,8 +206,7 @@ def unusable(name: str, points: list[EntryPoint], why: str) -> ConfigError:
 
 def misfit(name: str, problems: list[str]) -> ConfigError:
     """The error to raise where a graph with an installed mechanism does not fit together."""
-    points = [point for point in entry_points(GROUP) if point.name == name]
-    return unusable(name, points, f"its declaration does not fit: {'; '.join(problems)}")
+    return unusable(name, _points(name), f"its declaration does not fit: {'; '.join(problems)}")
 
 
 def _loaded(name: str, points: list[EntryPoint]) -> Mechanism:
@@ -210,8 +215,8 @@ def _loaded(name: str, points: list[EntryPoint]) -> Mechanism:
     try:
         return _checked(name, points[0].load())
     except (Exception, SystemExit) as error:  # whatever a stranger's module does
-        what = error if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
-        raise unusable(name, points, f"{points[0].place}: {what}") from error
+        what = str(error) if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
+        raise unusable(name, points, f"{points[0].place}: {' '.join(what.split())}") from error
 
 
 def _checked(name: str, found: object) -> Mechanism:
