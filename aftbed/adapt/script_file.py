@@ -246,7 +246,7 @@ def _brick_spec(name: str, value: object, where: str) -> BrickSpec:
     return BrickSpec(name, **texts)
 
 
-def _ports() -> tuple[str, ...]:
+def port_names() -> tuple[str, ...]:
     """Of all kinds of bricks that are known here: the mechanism of the script is."""
     return tuple(dict.fromkeys(p for kind in KINDS.values() for p in (*kind.inputs, *kind.outputs)))
 
@@ -282,8 +282,8 @@ def _end(text: str, where: str) -> tuple[str, str]:
     parts = text.split(".")
     for at in range(1, len(parts)):
         brick, port = ".".join(parts[:at]), ".".join(parts[at:])
-        if brick and port in _ports():
+        if brick and port in port_names():
             return brick, port
     if len(parts) == 1:
         raise ConfigError(f"{where}: found {text!r}, allowed is BRICK.PORT")
-    raise ConfigError(f"{where}: {unknown('port', parts[-1], _ports())}")
+    raise ConfigError(f"{where}: {unknown('port', parts[-1], port_names())}")
