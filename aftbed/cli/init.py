@@ -18,11 +18,15 @@ import typer
 from aftbed import functions
 from aftbed.cli.options import Json, print_json
 from aftbed.cli.parsing import PlainGroup
+from aftbed.cli.schema import schema_text
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.ftm import registry
+from aftbed.interop.files import write_text_whole
 
 FILE_TEMPLATES: Final = Path(__file__).with_name("templates")
-SCHEMA_FOLDER: Final = ".aftbed"
+_SCHEMA: Final = re.compile(
+    r"# yaml-language-server: \$schema=(?P<place>\.aftbed/(?P<kind>\w+)\.schema\.json)\n"
+)
 FILE_NAME: Final = re.compile(r"[a-z0-9][a-z0-9-]{0,40}")  # of a campaign, too
 
 init = typer.Typer(cls=PlainGroup)
@@ -46,7 +50,7 @@ FILES: Final = {
     "scenario": FileKind("a drive", "aftbed run --scenario @FILE@ --pace max"),
     "campaign": FileKind("many experiments and their gates", "aftbed campaign run @FILE@ --out @NAME@"),
     "map": FileKind(
-        "how a radar reports its targets, with a log of one",
+        "how a radar reports, with a log of one",
         "aftbed run --replay @LOG@ --dbc ars408-like --map @FILE@ --pace max",
         (".log",),
     ),
@@ -77,8 +81,6 @@ for _kind in FILES:
 
 def write_file(kind: str, name: str, to: Path | None) -> tuple[Path, dict[str, str]]:
     """The new file, and the words of its template. Raises ConfigError, leaving nothing new of it."""
-    from aftbed.cli.schema import schema_text  # noqa: PLC0415 - of files only
-
     if to is not None:
         name = to.stem
     if not FILE_NAME.fullmatch(name):
@@ -88,12 +90,10 @@ def write_file(kind: str, name: str, to: Path | None) -> tuple[Path, dict[str, s
     path = to or Path(f"{name}.yaml")
     if path.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"--to {path}: a file .yaml or .yml is allowed")
-    place = f"{SCHEMA_FOLDER}/{kind}.schema.json"
     words = {
         "NAME": name,
         "FILE": shlex.quote(str(path)),
         "LOG": shlex.quote(str(path.with_suffix(".log"))),
-        "SCHEMA": f"# yaml-language-server: $schema={place}",
     }
     endings = (".yaml", *FILES[kind].others)
     content = {
@@ -104,24 +104,28 @@ def write_file(kind: str, name: str, to: Path | None) -> tuple[Path, dict[str, s
     }
     with contextlib.ExitStack() as undo:
         for file, text in content.items():
-            _write_new(file, text)
-            undo.callback(file.unlink, missing_ok=True)
-        schema = path.parent / place
-        try:
-            schema.parent.mkdir(exist_ok=True)
-            schema.write_text(schema_text(kind) + "\n")
-        except OSError as error:
-            raise ConfigError(f"{schema}: cannot be written: {error.strerror}") from None
+            _write_new(file, text, undo)
+        for place, text in _schemas(content.values()).items():
+            _write_schema(path.parent / place, text)
         undo.pop_all()
     return path, words
 
 
-def _write_new(file: Path, text: str) -> None:
+def _write_new(file: Path, text: str, undo: contextlib.ExitStack) -> None:
     try:
         with file.open("x") as sink:
+            undo.callback(file.unlink, missing_ok=True)
             sink.write(text)
     except FileExistsError:
         raise ConfigError(f"{file}: is there already; choose another name, or --to FILE") from None
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be written: {error.strerror}") from None
+
+
+def _write_schema(file: Path, text: str) -> None:
+    try:
+        file.parent.mkdir(exist_ok=True)
+        write_text_whole(file, text)
     except OSError as error:
         raise ConfigError(f"{file}: cannot be written: {error.strerror}") from None
 
@@ -142,7 +146,7 @@ def mechanism(
     to: ToFolder = None,
     json: Json = False,
 ) -> None:
-    """Write a Python package with a mechanism: its brick, its declaration, tests, the entry point."""
+    """Write a package with a mechanism, tests, and the entry point by which it is found."""
     folder = write_mechanism(name, to)
     files = (file.replace("@NAME@", name) for file in MECHANISM_FILES)
     _tell(_below(folder, files), f"cd {shlex.quote(str(folder))} && pip install -e . && pytest", as_json=json)
@@ -247,7 +251,7 @@ def create(name: str, kind: str, to: Path | None = None) -> Path:
     for file, template in _files(kind).items():
         text = (TEMPLATES / template).read_text()
         content[file] = _filled(text, words) if template.endswith(SUFFIX) else text
-    return write_folder(to or Path(name), content)
+    return write_folder(to or Path(name), content | _schemas(content.values()))
 
 
 def _files(kind: str) -> dict[str, str]:
@@ -290,6 +294,12 @@ def write_folder(folder: Path, content: Mapping[str, str]) -> Path:
             raise ConfigError(f"{folder}: cannot be written: {error.strerror}") from None
         undo.pop_all()
     return folder
+
+
+def _schemas(texts: Iterable[str]) -> dict[str, str]:
+    """By its place, each schema that the first line of a text names."""
+    named = [found for text in texts if (found := _SCHEMA.match(text))]
+    return {found["place"]: f"{schema_text(found['kind'])}\n" for found in named}
 
 
 def _filled(template: str, words: Mapping[str, str]) -> str:

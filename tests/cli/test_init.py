@@ -36,7 +36,7 @@ def test_a_new_project_is_listed_with_the_next_command(refused: Callable[..., st
     folder = create("heater", "so")
     files = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
     common = {"README.md", "requests.csv", "test_function.py", "campaign.yaml", ".github/workflows/test.yml"}
-    assert files == common | {"function.c", "aft.h", "Makefile"}
+    assert files == common | {"function.c", "aft.h", "Makefile", ".aftbed/campaign.schema.json"}
     text = "".join(path.read_text() for path in folder.rglob("*") if path.is_file() and path.suffix != ".h")
     assert "heater" in text and "@APP@" not in text and "@NAME@" not in text
     assert len((folder / "README.md").read_text().splitlines()) <= 15
