@@ -54,9 +54,14 @@ FILES: Final = {
         "aftbed run --replay @LOG@ --dbc ars408-like --map @FILE@ --pace max",
         (".log",),
     ),
-    "policy": FileKind("when which mechanism is adapted", "aftbed run --policy @FILE@ --load 800@400"),
+    "policy": FileKind(
+        "when which mechanism is adapted",
+        'aftbed run --ftm lfr --load 800@400 --policy @FILE@ --inject "bitflip result in b nth 100"'
+        ' --inject "bitflip result in b nth 160"',
+    ),
     "script": FileKind(
-        "an adaptation, step by step", "aftbed run --ftm pbr --load 3000@100 & aftbed adapt script @FILE@"
+        "an adaptation, step by step",
+        "aftbed run --ftm pbr --load 3000@100; then in a second terminal: aftbed adapt script @FILE@",
     ),
 }
 
