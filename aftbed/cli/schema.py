@@ -40,7 +40,7 @@ def schema(
     kind: Annotated[str | None, typer.Argument(help=KIND_HELP)] = None,
     json: Json = False,
 ) -> None:
-    """Print the JSON Schema of a kind of YAML file, for editors that complete and check by it."""
+    """The JSON Schema of a kind of YAML file, for editors."""
     if kind is None and json:
         print_json({"kinds": {name: about for name, (_, about) in SHAPES.items()}})
     elif kind is None:
