@@ -27,6 +27,7 @@ COMMANDS: Final[CommandTable] = {
         "Many experiments from one file, judged with statistics, ended by a gate.",
     ),
     "log": ("log:log", "Convert a log of the bus or the record of a run for other tools."),
+    "completion": ("completion:completion", "The script that has bash, zsh or fish complete the words."),
     "map": ("maps:maps", "Maps of other radars: check one, propose one for a DBC and a log."),
     "scenario": (
         "scenario:scenario",

@@ -272,7 +272,7 @@ class BusFault(FaultKind, frozen=True, tag="bus"):
     def next_words(cls, words: Sequence[str], graph: Graph) -> Iterable[str]:
         """As `read_bus_fault` reads them. The messages are those of the car's own bus."""
         verb, *rest = words
-        keys = ("after", "when", "for", grammar.PERMANENT)
+        keys: tuple[str, ...] = ("after", "when", "for", grammar.PERMANENT)
         if verb in ON_NODES:
             sides = f"{NODES[0]}|{','.join(NODES[1:])}"
             places: list[_Words] = [lambda: (sides,) if verb == Partition.VERB else NODES]
