@@ -28,6 +28,7 @@ COMMANDS: Final[CommandTable] = {
     ),
     "log": ("log:log", "Convert a log of the bus or the record of a run for other tools."),
     "completion": ("completion:completion", "The script that has bash, zsh or fish complete the words."),
+    "man": ("manual:man", "The manual page: every command with its options, exit codes, files."),
     "map": ("maps:maps", "Maps of other radars: check one, propose one for a DBC and a log."),
     "scenario": (
         "scenario:scenario",

@@ -58,7 +58,7 @@ class Offer(NamedTuple):
 NOTHING: Final = Offer()
 
 
-class Line(NamedTuple):
+class TypedLine(NamedTuple):
     """The words before the cursor, read; `word` is the unfinished one, without its quote."""
 
     path: str  # of the command, as `inject crash`
@@ -117,7 +117,7 @@ def _plain(word: str) -> tuple[str, bool]:
 # -- reading the line -----------------------------------------------------------------------------
 
 
-def _read(before: Iterable[str], word: str, quoted: bool) -> Line | None:
+def _read(before: Iterable[str], word: str, quoted: bool) -> TypedLine | None:
     """None where there is no such command."""
     path, command = list[str](), typer.main.get_command(app)
     options: dict[str, list[str]] = {}
@@ -144,7 +144,7 @@ def _read(before: Iterable[str], word: str, quoted: bool) -> Line | None:
             arguments = [text] if whole else []
         else:
             arguments.append(text)
-    return Line(" ".join(path), command, options, arguments, awaiting, ended, word, quoted)
+    return TypedLine(" ".join(path), command, options, arguments, awaiting, ended, word, quoted)
 
 
 def _subcommands(command: Any) -> Mapping[str, Any]:
@@ -162,7 +162,7 @@ def _names(option: Any) -> tuple[str, ...]:
 # -- what may stand there -------------------------------------------------------------------------
 
 
-def _offer(line: Line) -> Offer:
+def _offer(line: TypedLine) -> Offer:
     if line.awaiting is not None:
         return _values(line, line.awaiting, line.awaiting.opts[0])
     if line.word.startswith("-") and not line.only_arguments:
@@ -185,7 +185,7 @@ def _offer(line: Line) -> Offer:
     return _argument(line)
 
 
-def _argument(line: Line) -> Offer:
+def _argument(line: TypedLine) -> Offer:
     places = [one for one in line.command.params if one.param_type_name == "argument"]
     at = len(line.arguments)
     place = places[at] if at < len(places) else next((one for one in places[-1:] if one.nargs == -1), None)
@@ -194,7 +194,7 @@ def _argument(line: Line) -> Offer:
     return NOTHING if line.word else _matching("", _other_options(line))
 
 
-def _other_options(line: Line) -> Iterator[tuple[str, str]]:
+def _other_options(line: TypedLine) -> Iterator[tuple[str, str]]:
     """Those that can still be given."""
     for option in _options(line.command):
         if option.multiple or option.opts[0] not in line.options:
@@ -202,7 +202,7 @@ def _other_options(line: Line) -> Iterator[tuple[str, str]]:
     yield "--help", "What the command does, and its options."
 
 
-def _values(line: Line, parameter: Any, name: str) -> Offer:
+def _values(line: TypedLine, parameter: Any, name: str) -> Offer:
     known = VALUES.get(f"{line.path} {name}", VALUES.get(name))
     if known is None:
         if choices := _choices(parameter.metavar or ""):
@@ -243,8 +243,8 @@ def _short(about: str) -> str:
 
 # -- kinds of values ------------------------------------------------------------------------------
 
-Values = Callable[[Line], Offer]
-Names = Callable[[Line], Iterable[str]]
+Values = Callable[[TypedLine], Offer]
+Names = Callable[[TypedLine], Iterable[str]]
 
 
 def _names_of(names: Names) -> Values:
@@ -254,7 +254,7 @@ def _names_of(names: Names) -> Values:
 def _names_or_files(names: Names) -> Values:
     """Files where no name begins so."""
 
-    def offer(line: Line) -> Offer:
+    def offer(line: TypedLine) -> Offer:
         found = _matching(line.word, ((name, "") for name in names(line)))
         return found if found.words else Offer(How.FILES)
 
@@ -264,7 +264,7 @@ def _names_or_files(names: Names) -> Values:
 def _separated(names: Names) -> Values:
     """Several of them, with commas."""
 
-    def offer(line: Line) -> Offer:
+    def offer(line: TypedLine) -> Offer:
         *given, last = line.word.split(",")
         begin = "".join(f"{name}," for name in given)
         known = ((f"{begin}{name}", "") for name in names(line._replace(word=last)) if name not in given)
@@ -273,14 +273,14 @@ def _separated(names: Names) -> Values:
     return offer
 
 
-def _text(following: Callable[[Line, list[str]], Iterable[str]]) -> Values:
+def _text(following: Callable[[TypedLine, list[str]], Iterable[str]]) -> Values:
     """Words with spaces between them, as one word of the shell: in quotes.
 
     A shell closes the quotes behind the only text that is offered. So where more may follow, all that begins
     so is offered: the shell inserts what they share, and leaves the quotes open.
     """
 
-    def offer(line: Line) -> Offer:
+    def offer(line: TypedLine) -> Offer:
         done = [word for word in line.word.split(" ")[:-1] if word]
         begin = "".join(f"{word} " for word in done)
         found = _matching(line.word, ((f"{begin}{word}", "") for word in following(line, done))).words
@@ -297,11 +297,11 @@ def _text(following: Callable[[Line, list[str]], Iterable[str]]) -> Values:
     return offer
 
 
-def _files(line: Line) -> Offer:
+def _files(line: TypedLine) -> Offer:
     return Offer(How.FILES)
 
 
-def _folders(line: Line) -> Offer:
+def _folders(line: TypedLine) -> Offer:
     return Offer(How.FOLDERS)
 
 
@@ -309,7 +309,7 @@ def _folders(line: Line) -> Offer:
 # What a command needs for itself is imported with it; the rest is imported here, where it is asked for.
 
 
-def _mechanisms(line: Line) -> list[str]:
+def _mechanisms(line: TypedLine) -> list[str]:
     """Expressions one mechanism longer than what stands before the last `+`; two if only one begins so."""
     begin = line.word.rpartition("+")[0]
     found = [one for one in _longer(begin) if one.startswith(line.word)]
@@ -329,7 +329,7 @@ def _longer(expression: str) -> list[str]:
     return found
 
 
-def _scenarios(line: Line) -> list[str]:
+def _scenarios(line: TypedLine) -> list[str]:
     """With the rows of a table behind its name and the colon."""
     from aftbed.vehicle.scenarios.library import scenario_names  # noqa: PLC0415
     from aftbed.vehicle.scenarios.tables import SEPARATOR, cases, table_names  # noqa: PLC0415
@@ -340,13 +340,13 @@ def _scenarios(line: Line) -> list[str]:
     return scenario_names()
 
 
-def _tables(line: Line) -> list[str]:
+def _tables(line: TypedLine) -> list[str]:
     from aftbed.vehicle.scenarios.tables import table_names  # noqa: PLC0415
 
     return table_names()
 
 
-def _groups(line: Line) -> list[str]:
+def _groups(line: TypedLine) -> list[str]:
     from aftbed.vehicle.scenarios.tables import group_names  # noqa: PLC0415
 
     with contextlib.suppress(ConfigError):
@@ -354,43 +354,43 @@ def _groups(line: Line) -> list[str]:
     return []
 
 
-def _campaigns(line: Line) -> list[str]:
+def _campaigns(line: TypedLine) -> list[str]:
     from aftbed.campaign.spec import shipped  # noqa: PLC0415
 
     return shipped()
 
 
-def _policies(line: Line) -> list[str]:
+def _policies(line: TypedLine) -> list[str]:
     from aftbed.runtime.unix.closed_loop import policy_names  # noqa: PLC0415
 
     return policy_names()
 
 
-def _maps(line: Line) -> list[str]:
+def _maps(line: TypedLine) -> list[str]:
     from aftbed.vehicle.replay.map_file import shipped_maps  # noqa: PLC0415
 
     return shipped_maps()
 
 
-def _dbcs(line: Line) -> list[str]:
+def _dbcs(line: TypedLine) -> list[str]:
     from aftbed.vehicle.replay.map_file import shipped_dbcs  # noqa: PLC0415
 
     return shipped_dbcs()
 
 
-def _fault_classes(line: Line) -> list[str]:
+def _fault_classes(line: TypedLine) -> list[str]:
     from aftbed.adapt.suitability import FAULTS  # noqa: PLC0415
 
     return [str(name) for name in FAULTS]
 
 
-def _function_faults(line: Line) -> list[str]:
+def _function_faults(line: TypedLine) -> list[str]:
     from aftbed.search.ftti import FunctionFault  # noqa: PLC0415
 
     return list(FunctionFault)
 
 
-def _log_formats(line: Line) -> list[str]:
+def _log_formats(line: TypedLine) -> list[str]:
     from aftbed.interop.logs import ENDINGS  # noqa: PLC0415
 
     return list(dict.fromkeys(ENDINGS.values()))
@@ -399,13 +399,13 @@ def _log_formats(line: Line) -> list[str]:
 # -- live runs ------------------------------------------------------------------------------------
 
 
-def _runs(line: Line) -> list[str]:
+def _runs(line: TypedLine) -> list[str]:
     from aftbed.runtime.unix.run_directory import owned_runs  # noqa: PLC0415
 
     return owned_runs()
 
 
-def _graph(line: Line) -> Any:
+def _graph(line: TypedLine) -> Any:
     """That of the run that is meant, live or to be started; that of `pbr` where none answers."""
     from aftbed.ftm.compose import build  # noqa: PLC0415
 
@@ -424,13 +424,13 @@ def _graph(line: Line) -> Any:
     return build("pbr", "process")
 
 
-def _behind_fault(line: Line, words: list[str]) -> list[str]:
+def _behind_fault(line: TypedLine, words: list[str]) -> list[str]:
     from aftbed.inject.model import next_words  # noqa: PLC0415
 
     return next_words(words, _graph(line))
 
 
-def _behind_bus_fault(line: Line, words: list[str]) -> list[str]:
+def _behind_bus_fault(line: TypedLine, words: list[str]) -> list[str]:
     from aftbed.inject.bus import BUS, BusFault  # noqa: PLC0415
 
     if not words:
@@ -438,13 +438,13 @@ def _behind_bus_fault(line: Line, words: list[str]) -> list[str]:
     return [BUS] if BUS in _behind_fault(line, words) else _behind_fault(line, words)
 
 
-def _behind_radar(line: Line) -> list[str]:
+def _behind_radar(line: TypedLine) -> list[str]:
     from aftbed.inject.radar import RADAR  # noqa: PLC0415
 
     return _behind_fault(line, [RADAR, *line.arguments])
 
 
-def _subjects(line: Line) -> list[str]:
+def _subjects(line: TypedLine) -> list[str]:
     """What a fault of this name can hit; the bus has a command of its own."""
     from aftbed.inject.bus import BUS  # noqa: PLC0415
 
@@ -452,25 +452,25 @@ def _subjects(line: Line) -> list[str]:
     return [name for name in _behind_fault(line, [kind]) if name != BUS]
 
 
-def _events(line: Line) -> list[str]:
+def _events(line: TypedLine) -> list[str]:
     from aftbed.inject.targets import events_in  # noqa: PLC0415
 
     return events_in(_graph(line))
 
 
-def _replicas(line: Line) -> list[str]:
+def _replicas(line: TypedLine) -> list[str]:
     from aftbed.inject.targets import replicas, roles_in  # noqa: PLC0415
 
     graph = _graph(line)
     return [*roles_in(graph), *replicas(graph)]
 
 
-def _behind_when(line: Line, words: list[str]) -> list[str]:
+def _behind_when(line: TypedLine, words: list[str]) -> list[str]:
     """`ttc < 1.2`."""
     return _behind_fault(line, ["crash", "primary", "when", *words]) if len(words) < 3 else []
 
 
-def _bricks(line: Line) -> list[str]:
+def _bricks(line: TypedLine) -> list[str]:
     """As `adapt update` names them: without their replica, and the function as `app`."""
     from aftbed.adapt.planner import APPLICATION  # noqa: PLC0415
 
@@ -478,7 +478,7 @@ def _bricks(line: Line) -> list[str]:
     return [APPLICATION, *(part for part in parts if part != "watchdog")]
 
 
-def _goals(line: Line) -> list[str]:
+def _goals(line: TypedLine) -> list[str]:
     """Expressions to which the verb of the command leads from what runs."""
     from aftbed.adapt.commands import Wish, goal  # noqa: PLC0415
     from aftbed.ftm.compose import EXPRESSIONS, NONE  # noqa: PLC0415
@@ -492,7 +492,7 @@ def _goals(line: Line) -> list[str]:
     return sorted(found)
 
 
-def _behind_adaptation(line: Line, words: list[str]) -> list[str]:
+def _behind_adaptation(line: TypedLine, words: list[str]) -> list[str]:
     """`compose lfr+tr at request 120`."""
     from aftbed.adapt.commands import VERBS  # noqa: PLC0415
 

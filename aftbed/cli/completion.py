@@ -14,7 +14,7 @@ import typer
 from aftbed.cli.parsing import PlainGroup
 
 SHELLS: Final = Path(__file__).resolve().parent / "shells"
-SECONDS_MAX: Final = 1.5  # whatever blocks, a shell gets its prompt back
+SECONDS_MAX: Final = 10.0  # whatever blocks that should not, a shell gets its prompt back
 
 completion = typer.Typer(cls=PlainGroup)
 

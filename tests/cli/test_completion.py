@@ -1,5 +1,6 @@
 """What a shell is offered at a TAB; `test_completion_shells.py` presses it in real shells."""
 
+import functools
 import socket
 from collections.abc import Iterator
 from typing import Any
@@ -29,7 +30,8 @@ def offered(*words: str) -> list[str]:
     return [word for word, _ in offer.words]
 
 
-def commands() -> Iterator[tuple[str, Any]]:
+@functools.cache  # all modules of commands are imported
+def commands() -> list[tuple[str, Any]]:
     """Every command with its path, groups included."""
 
     def inside(command: Any, path: str) -> Iterator[tuple[str, Any]]:
@@ -38,7 +40,7 @@ def commands() -> Iterator[tuple[str, Any]]:
         for name, inner in getattr(command, "commands", {}).items():
             yield from inside(inner, f"{path} {name}".strip())
 
-    return inside(typer.main.get_command(app), "")
+    return list(inside(typer.main.get_command(app), ""))
 
 
 # -- commands and options -------------------------------------------------------------------------
