@@ -115,6 +115,11 @@ def engine(*folders: Path) -> jinja2.Environment:
     return found
 
 
+def space_time_svg(diagram: SpaceTime) -> str:
+    """The diagram as a file of its own, as the pages have it."""
+    return page_text(engine(TEMPLATES).get_template("spacetime.svg.j2"), d=diagram)
+
+
 def page_text(page: jinja2.Template, **values: object) -> str:
     """The page without characters that no HTML may contain."""
     return _UNREADABLE.sub("�", page.render(**values))
