@@ -663,8 +663,8 @@ class _ManyRuns:
         ]
         if given.diagram is not None and self._broken:
             broken_setup, breaches = self._broken[0]
-            show = partial(picture, broken=breaches, path=given.diagram)
-            Path(given.diagram).write_text(self._simulated_again(show, broken_setup).diagram)
+            draw = partial(picture, broken=breaches, path=given.diagram)
+            Path(given.diagram).write_text(self._simulated_again(draw, broken_setup).diagram)
         elif given.diagram is not None:
             print(f"aftbed: note: nothing broke: {given.diagram} is not written", file=sys.stderr)
         self._show(broken, (first, first + self._runs - 1), max(took_s, 1e-9))
