@@ -27,13 +27,13 @@ COMMANDS: Final[CommandTable] = {
         "Many experiments from one file, judged with statistics, ended by a gate.",
     ),
     "log": ("log:log", "Convert a log of the bus or the record of a run for other tools."),
-    "completion": ("completion:completion", "The script that has bash, zsh or fish complete the words."),
-    "man": ("manual:man", "The manual page: every command with its options, exit codes, files."),
     "map": ("maps:maps", "Maps of other radars: check one, propose one for a DBC and a log."),
     "scenario": (
         "scenario:scenario",
         "Drives and published tables: what must stop, and what still does under faults.",
     ),
+    "completion": ("completion:completion", "Have bash, zsh or fish complete words: the script for it."),
+    "man": ("manual:man", "The manual page: commands, options, exit codes, files."),
 }
 
 
