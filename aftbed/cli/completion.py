@@ -4,8 +4,8 @@ The scripts are in `shells/`. They call `aftbed completion answer -- WORDS` at e
 the cursor as they were typed, the last one unfinished; `completer` has the answer.
 """
 
+import faulthandler
 import os
-import signal
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -47,8 +47,12 @@ _shell_command(
 @completion.command(hidden=True)
 def answer(words: Annotated[list[str] | None, typer.Argument()] = None) -> None:
     """For the scripts: what may stand at the end of WORDS."""
-    signal.signal(signal.SIGALRM, lambda *_: os._exit(0))
-    signal.setitimer(signal.ITIMER_REAL, SECONDS_MAX)
     from aftbed.cli.completer import complete  # noqa: PLC0415 - the scripts need none of it
 
-    typer.echo("\n".join(complete(words or [""]).lines()))
+    with open(os.devnull, "w") as null:
+        faulthandler.dump_traceback_later(SECONDS_MAX, exit=True, file=null)
+        try:
+            lines = complete(words or [""]).lines()
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+    typer.echo("\n".join(lines))

@@ -3,7 +3,7 @@
 import functools
 import socket
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Final
 
 import pytest
 import typer
@@ -18,9 +18,11 @@ from aftbed.cli.app import app
 from aftbed.cli.completer import VALUES, How, Offer, complete
 from aftbed.cli.lazy import LazyCommand
 from aftbed.ftm.compose import build
-from aftbed.runtime.unix import run_directory
+from aftbed.runtime.unix import control_client, run_directory
 from aftbed.vehicle.replay.map_file import shipped_maps
 from aftbed.vehicle.scenarios.library import scenario_names
+
+FOREVER: Final = 3600.0  # s
 
 
 def offered(*words: str) -> list[str]:
@@ -208,7 +210,14 @@ def test_two_live_runs_are_offered_and_neither_is_asked(
 
 
 @pytest.mark.parametrize("backlog", [0, 8], ids=["busy", "stopped"])
-def test_a_run_that_does_not_answer_is_not_waited_for(home: Home, backlog: int) -> None:
+def test_a_run_that_does_not_answer_is_not_waited_for(
+    home: Home, backlog: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What asks without saying how long waits here for longer than any test lasts."""
+    for module in (control_client, run_directory):
+        monkeypatch.setattr(module, "ANSWER_SECONDS_MAX", FOREVER)
+    for function in (control_client.ask, control_client.send, control_client.receive, run_directory.connect):
+        monkeypatch.setattr(function, "__defaults__", (FOREVER,))
     private = run_directory.free()
     run_directory.make(private)
     others = []
