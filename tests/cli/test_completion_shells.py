@@ -21,6 +21,7 @@ from liveruns import Home
 
 SECONDS_MAX: Final = 60.0  # for a shell on a busy machine
 PROMPT: Final = "ready> "
+PLACED: Final = ["aftbed", "run", "--placement", "single", "--ftm", "pbr+tr"]
 TO_BEGIN: Final = "\x01"  # of the line
 BASH: Final = """
 PS1='{prompt}'
@@ -100,17 +101,10 @@ def shell(request: pytest.FixtureRequest, home: Home, tmp_path: Path) -> Iterato
     found.end()
 
 
-def test_commands_options_and_names(shell: Shell) -> None:
+def test_words_are_completed_at_a_tab(shell: Shell, tmp_path: Path) -> None:
     assert shell.line("aftbed scen\tru\tccrs-2\t") == ["aftbed", "scenario", "run", "ccrs-20"]
-    assert shell.line("aftbed run --scena\tccrs-2\t") == ["aftbed", "run", "--scenario", "ccrs-20"]
-    assert shell.line("aftbed run --ftm pbr+t\t") == ["aftbed", "run", "--ftm", "pbr+tr"]
-
-
-def test_a_fault_in_quotes(shell: Shell) -> None:
-    found = shell.line('aftbed sim --inject "crash pri\tat server.ex\tnth 3"')
-    assert found == ["aftbed", "sim", "--inject", "crash primary at server.exit nth 3"]
-
-
-def test_a_file(shell: Shell, tmp_path: Path) -> None:
+    assert shell.line("aftbed run --placem\tsin\t--ftm pbr+t\t") == PLACED
+    in_quotes = shell.line('aftbed sim --inject "crash pri\tat server.ex\tnth 3"')
+    assert in_quotes == ["aftbed", "sim", "--inject", "crash primary at server.exit nth 3"]
     (tmp_path / "my drive.yaml").touch()
     assert shell.line("aftbed run --scenario my\t") == ["aftbed", "run", "--scenario", "my drive.yaml"]
