@@ -8,7 +8,7 @@ from typing import Final
 
 import pytest
 import typer
-from pages import PAGES, ROOT, anchors, blocks, links, names, prose, sections, table
+from pages import PAGES, ROOT, anchors, blocks, images, links, names, prose, sections, table
 from requestpath import REQUEST_PATH
 
 from aftbed.cli import EXIT_READER_GONE, EXIT_USAGE
@@ -61,7 +61,7 @@ COMMANDS: Final = dict(commands())
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_relative_link_leads_somewhere(page: Path) -> None:
-    for link in links(page):
+    for link in (*links(page), *images(page)):
         if "://" in link:
             continue
         path, _, anchor = link.partition("#")
