@@ -16,7 +16,7 @@ from pages import PAGES, ROOT, blocks
 README: Final = ROOT / "README.md"
 CHANGELOG: Final = ROOT / "CHANGELOG.md"
 TOOLS: Final = ("sphinx", "myst_parser", "furo", "mmdr")
-FETCHED: Final = {"link": "href", "script": "src", "img": "src", "iframe": "src", "source": "src"}
+FETCHED: Final = {"script": "src", "img": "src", "iframe": "src", "source": "src"}
 MISSING: Final = [tool for tool in TOOLS if importlib.util.find_spec(tool) is None]
 
 
@@ -59,6 +59,8 @@ class BuiltPage(HTMLParser):
         self.anchors |= {given["id"]} if "id" in given else set()
         if tag == "a" and "href" in given:
             self.links.append(given["href"])
+        if tag == "link" and {"stylesheet", "icon"} & set(given["rel"].split()):
+            self.fetched.append(given["href"])
         if FETCHED.get(tag) in given:
             self.fetched.append(given[FETCHED[tag]])
 
@@ -104,10 +106,12 @@ def test_a_lost_link_and_a_fetched_script_are_found(tmp_path: Path) -> None:
     page.write_text(
         '<h1 id="a"></h1><a href="#a"></a><a href="#b"></a><a href="gone.html"></a><a href="https://x.org"></a>'
         '<script src="https://x.org/y.js"></script><img src="page.html"><img src="gone.png">'
+        '<link rel="stylesheet" href="gone.css"><link rel="next" href="https://x.org">'
     )
     assert list(lost({page: BuiltPage(page)})) == [
         "page.html fetches https://x.org/y.js",
         "page.html fetches gone.png",
+        "page.html fetches gone.css",
         "page.html links #b",
         "page.html links gone.html",
     ]
