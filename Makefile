@@ -27,7 +27,7 @@ FAULT := crash primary at checkpoint.sent nth 100
 # Hundreds of interpreters start in the tests; without bytecode each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test lint fast simulation process deep mutants bench soak docs
+.PHONY: help demo test lint fast simulation process deep mutants bench soak docs pictures
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
 
@@ -40,6 +40,7 @@ help:
 	@echo "make process     the tests that start real runs: a sample of their combinations"
 	@echo "make deep        the exhaustive tests, and thousands of examples of every property: hours"
 	@echo "make docs        the pages of docs/ as a site: build/docs/index.html"
+	@echo "make pictures    the pictures of the README, of runs that it makes (ONLY=page: that one; with Chromium and tmux)"
 	@echo "make mutants     plant bugs one by one, see what notices them, write docs/assumptions.md (ONLY=words: some, print)"
 	@echo "make soak        one run of 30 minutes with a crash every 2 s, an adaptation every 5 s: does anything grow?"
 	@echo "make bench       every figure of docs/numbers.md, written into its table: ten minutes (OLD=VENV: then compare with it)"
@@ -81,6 +82,9 @@ soak: $(EDITABLE)
 docs: $(DOCS)
 	$(BIN)/python -m sphinx -W --keep-going -E -q -b html -d build/doctrees -c docs . build/docs
 	@echo "build/docs/index.html"
+
+pictures: $(EDITABLE)
+	$(BIN)/python tests/docs/make_pictures.py $(ONLY)
 
 # -- installation: a stamp each, so that a second `make` installs only what has changed ------------
 
