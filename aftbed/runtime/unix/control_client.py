@@ -152,7 +152,12 @@ def receive(line: Line[Answer], seconds: float = ANSWER_SECONDS_MAX) -> dict[str
 
 def processes(private: Path) -> list[ProcessRow]:
     """The processes of the run in `private`."""
-    return msgspec.convert(ask(private, ProcessesQuery())["processes"], list[ProcessRow])
+    return process_rows(ask(private, ProcessesQuery()))
+
+
+def process_rows(answer: dict[str, object]) -> list[ProcessRow]:
+    """Those in the answer to a ProcessesQuery."""
+    return msgspec.convert(answer["processes"], list[ProcessRow])
 
 
 def measured(rows: list[ProcessRow]) -> list[ProcessRow]:
