@@ -29,7 +29,7 @@ is any other. An outcome that is better than the expected ones counts as unexpec
 sees anything is no oracle.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Final, Literal
@@ -49,7 +49,7 @@ from aftbed.functions.request_file import located_requests
 from aftbed.functions.source import located
 from aftbed.judge.outcome import OUTCOMES
 from aftbed.runtime.unix.options import CarRun, LoadRun, ftti_ms_of
-from aftbed.vehicle.scenarios.library import load_scenario
+from aftbed.vehicle.scenarios.library import load_scenario, located_scenario
 
 SHIPPED: Final = Path(__file__).resolve().parent.parent / "campaigns"
 ANY: Final = "*"
@@ -90,8 +90,8 @@ Share = Annotated[float, Meta(gt=0, lt=1)]
 class System(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What the mechanisms protect: `app` ("": the brake), asked for `requests` of a load, or by a car.
 
-    `request_file`: what is sent, as `--requests` has it; behind the last of a file comes the first. It and
-    `app` are looked up beside the campaign file.
+    `request_file`: what is sent, as `--requests` has it; behind the last of a file comes the first. Relative
+    paths are looked up beside the campaign file, and then in the current directory.
     """
 
     app: str = ""  # the protected function, as --app has it; none: the brake
@@ -209,13 +209,7 @@ def read_spec(name: str) -> Spec:
             raise unknown("campaign", name, shipped())
     spec = read_yaml(path, Spec)
     try:
-        if spec.system.app:
-            system = msgspec.structs.replace(spec.system, app=located(spec.system.app, path.parent))
-            spec = msgspec.structs.replace(spec, system=system)
-        if spec.system.request_file:
-            source = located_requests(spec.system.request_file, path.parent)
-            system = msgspec.structs.replace(spec.system, request_file=source)
-            spec = msgspec.structs.replace(spec, system=system)
+        spec = msgspec.structs.replace(spec, system=_located(spec.system, path.parent))
         check(spec)
         if spec.system.scenario:  # here, since records are reported where the scenario's file is not
             verifies = dict.fromkeys((*spec.verifies, *load_scenario(spec.system.scenario).verifies))
@@ -223,6 +217,39 @@ def read_spec(name: str) -> Spec:
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
     return spec
+
+
+_Locator = Callable[[str, Path], str]
+
+
+def _located(system: System, folder: Path) -> System:
+    """With absolute paths, of files in `folder` or else in the current directory. Raises ConfigError."""
+    locators: dict[str, _Locator] = {
+        "app": located,
+        "request_file": located_requests,
+        "scenario": located_scenario,
+    }
+    found = {}
+    for key, locate in locators.items():
+        if text := getattr(system, key):
+            try:
+                found[key] = _beside_or_here(text, folder, locate)
+            except ConfigError as error:
+                raise ConfigError(f"system.{key}: {error}") from error
+    return msgspec.structs.replace(system, **found)
+
+
+def _beside_or_here(text: str, folder: Path, locate: _Locator) -> str:
+    here = Path.cwd()
+    try:
+        return locate(text, folder)
+    except ConfigError as error:
+        if folder.resolve() == here:
+            raise
+        try:
+            return locate(text, here)
+        except ConfigError:
+            raise ConfigError(f"{error}, beside the campaign file or in {here}") from error
 
 
 def shipped() -> list[str]:

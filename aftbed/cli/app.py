@@ -34,6 +34,8 @@ COMMANDS: Final[CommandTable] = {
         "scenario:scenario",
         "Drives and published tables: what must stop, and what still does under faults.",
     ),
+    "completion": ("completion:completion", "Have bash, zsh or fish complete words: the script for it."),
+    "man": ("manual:man", "The manual page: commands, options, exit codes, files."),
 }
 
 

@@ -114,12 +114,17 @@ def check_event(event: str, graph: Graph) -> None:
     """Raise ConfigError unless `event`, if there is one, is emitted in `graph`."""
     if not event:
         return
-    label = event_named(event).label
-    roles = Roles(graph, "a", "b")
-    emitted = {e.label for e in (*EMITTERS, *ADAPTATION) if emitting_node(roles, e.label) is not None}
+    label, emitted = event_named(event).label, events_in(graph)
     if label not in emitted:
-        found = ", ".join(sorted(emitted))
+        found = ", ".join(emitted)
         raise ConfigError(f"event {label!r} cannot trigger a fault under --ftm {graph.ftm} (one of: {found})")
+
+
+def events_in(graph: Graph) -> list[str]:
+    """The labels of the events that are emitted in `graph`, sorted."""
+    roles = Roles(graph, "a", "b")
+    found = {e.label for e in (*EMITTERS, *ADAPTATION) if emitting_node(roles, e.label) is not None}
+    return sorted(found)
 
 
 def _nodes(event: str, graph: Graph) -> tuple[str, ...]:
