@@ -175,8 +175,8 @@ def read_record(path: Path, *, in_memory: bool = False) -> RunRecord:
     except msgspec.ValidationError as error:
         raise ConfigError(f"{what}: started_ns: {error}") from None
     adaptations = _adaptations(path)
-    for name, one in {**{a.ftm: HISTORY_NAME for a in adaptations}, options.ftm: "run.json"}.items():
-        _check_mechanism(path / one, name, options.packages)
+    for ftm, one in ((options.ftm, "run.json"), *((a.ftm, HISTORY_NAME) for a in adaptations)):
+        _check_mechanism(path / one, ftm, options.packages)
     history = _history(path / "journal", in_memory=in_memory)
     end = _end(path / "end.json") if (path / "end.json").exists() else None
     faults = (
