@@ -29,6 +29,7 @@ from aftbed.campaign.plan import plan
 from aftbed.campaign.spec import FaultEntry, Spec, StopRule, System, check
 from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import HarnessError
+from aftbed.core.progress import Show, unshown
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix import linux
 from aftbed.vehicle.aeb.function import default_application, sample_requests
@@ -70,6 +71,7 @@ def bench_campaign(
     jobs: int,
     *,
     rounds: int = ROUNDS,
+    show: Show = unshown,
 ) -> CampaignResult:
     """Carry out campaigns of one stratum, a round each. Raises ConfigError."""
     share = shares(experiments, rounds)
@@ -86,7 +88,7 @@ def bench_campaign(
             return forks_ms(processes, share[number], jobs)
         return requests_ms(system.requests, share[number])
 
-    found = in_turn(len(share), lambda number: _carried_out(specs[number], jobs), limit)
+    found = in_turn(len(share), lambda number: _carried_out(specs[number], jobs), limit, show=show)
     times = [1e3 * one.seconds / len(one.results) for one in found.figures]
     name = f"fork and wait of {processes} processes" if runtime == "unix" else "its requests, bare"
     beside = beside_limit(name, [[ms] for ms in times], [[ms] for ms in found.limits])

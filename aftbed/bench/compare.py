@@ -36,6 +36,7 @@ from aftbed.bench.rounds import ROUNDS, Meanwhile, in_turn, text
 from aftbed.bench.runs import TRIES, CommandFailedError, Log, run_python
 from aftbed.campaign.statistics import CONFIDENCE, Interval, quantile, quantile_interval
 from aftbed.core.errors import ConfigError, HarnessError, unknown
+from aftbed.core.progress import Show, unshown
 
 DEFAULT: Final = ("cycle --ftm pbr --requests 1100",)
 VERSION_SECONDS_MAX: Final = 60.0
@@ -119,6 +120,7 @@ def bench_compare(
     *,
     rounds: int = ROUNDS,
     measure: Measure | None = None,
+    show: Show = unshown,
 ) -> VersionComparison:
     """Measure `benches` (words behind `aftbed bench`) of both, `rounds` times. Raises ConfigError."""
     for bench in benches:
@@ -135,8 +137,15 @@ def bench_compare(
         log(f"{venv}: aftbed bench {bench}, round {number + 1} of {rounds}")
         return (measure or measured)(venv, bench)
 
-    for bench in dict.fromkeys(benches):
-        found = in_turn(rounds, partial(document, new, bench), partial(document, old, bench), 0)
+    different = list(dict.fromkeys(benches))
+    for number, bench in enumerate(different):
+
+        def shown_of_all(done: float, of: float, before: int = number) -> None:
+            show(before * of + done, len(different) * of)
+
+        found = in_turn(
+            rounds, partial(document, new, bench), partial(document, old, bench), 0, show=shown_of_all
+        )
         machine[bench] = found.machine
         for figure in FIGURES[shlex.split(bench)[0]]:
             of_figure = _changes(bench, figure, found.limits, found.figures)

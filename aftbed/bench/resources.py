@@ -43,6 +43,7 @@ from aftbed.bench.runs import (
 from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import HarnessError
 from aftbed.core.journal import EntryKind
+from aftbed.core.progress import Show, unshown
 from aftbed.judge.record import read_record
 from aftbed.runtime.unix import control_client, linux
 from aftbed.runtime.unix.control_client import ProcessRow, measured
@@ -118,7 +119,7 @@ class MemoryResult(msgspec.Struct, frozen=True):
     machine: Meanwhile
 
 
-def bench_memory(ftm: str, placement: str) -> MemoryResult:
+def bench_memory(ftm: str, placement: str, show: Show = unshown) -> MemoryResult:
     """Memory of a car's drive, when it has settled; CPU of a run that is idle. Raises HarnessError."""
     watch = MachineWatch()
     options, listener = options_for(ftm=ftm, placement=placement, work=CarRun("free-drive", 1.0, "latch"))
@@ -131,6 +132,7 @@ def bench_memory(ftm: str, placement: str) -> MemoryResult:
     finally:
         launched.stop()
         finished(launched, STOPPED[:1])
+    show(1, 2)
     nodes = [row for row in rows if row.node]
     others: dict[str, MemoryOfOthers] = {}
     for row in rows:
@@ -269,7 +271,7 @@ class _Start(NamedTuple):
     help_ms: float
 
 
-def bench_launch(ftm: str, placement: str, runs: int) -> LaunchResult:
+def bench_launch(ftm: str, placement: str, runs: int, show: Show = unshown) -> LaunchResult:
     """Start `aftbed run` and its help page so many times, a round each. Raises HarnessError."""
 
     def start(number: int) -> _Start:
@@ -278,7 +280,7 @@ def bench_launch(ftm: str, placement: str, runs: int) -> LaunchResult:
     def limits(number: int) -> tuple[float, float]:
         return _python_ms("-c", IMPORTS), _python_ms("-c", HELP_IMPORTS)
 
-    found = in_turn(runs, start, limits)
+    found = in_turn(runs, start, limits, show=show)
     launches, graphs, helps = ([one[n] for one in found.figures] for n in range(3))
     imports, typers = ([one[n] for one in found.limits] for n in range(2))
     beside = beside_limit("import of its libraries", _alone(launches), _alone(imports))

@@ -42,6 +42,7 @@ from aftbed.functions.source import located
 from aftbed.interop.files import write_text_whole, write_whole
 from aftbed.judge.verdict import EXIT_INTERRUPTED
 from aftbed.report.export import write_csv, write_parquet
+from aftbed.report.progress import ProgressLine
 from aftbed.runtime.unix.trust import NOBODY, OWN_RUN, Trust, trusting
 
 RUNTIMES: Final = ("unix", "sim")
@@ -215,7 +216,7 @@ def run(given: CampaignRunArguments) -> int:
     results = runner.run(found, options)  # raises ConfigError here, before the progress is shown
     todo = sum(options.has(index, len(found.strata)) for index in range(found.size))
     try:
-        with closing(results), CampaignProgress(found.spec.campaign, todo, quiet=given.json) as progress:
+        with closing(results), CampaignProgress(found.spec.campaign, todo, plain=not given.json) as progress:
             for result in results:
                 progress.add(result)
     except KeyboardInterrupt:
@@ -374,7 +375,8 @@ def bundle(
     from aftbed.report.bundle import SUMS, archive_of, entries, sha256  # noqa: PLC0415 - scipy
 
     check_file("--out", out, ".zip")
-    made = entries([_ledger(folder) for folder in folders], trusting(trust))
+    with ProgressLine("campaign bundle", unit="runs", plain=not json) as progress:
+        made = entries([_ledger(folder) for folder in folders], trusting(trust), progress.show)
     data = archive_of(made)
     write_whole(out, lambda path: path.write_bytes(data))
     files = {name: sha256(entry.data) for name, entry in made.items() if name != SUMS}
@@ -392,7 +394,8 @@ def verify(file: BundleFile, json: Json = False) -> None:
     """
     from aftbed.report.bundle import verified  # noqa: PLC0415 - scipy
 
-    found = verified(file)
+    with ProgressLine("campaign verify", unit="files", plain=not json) as progress:
+        found = verified(file, progress.show)
     if json:
         print_json({"bundle": file.name} | asdict(found))
     else:
@@ -416,7 +419,8 @@ def argument(
     from aftbed.report.bundle import campaigns_in, verified  # noqa: PLC0415
 
     check_file("--plot", plot, ".svg")
-    checked = verified(file)
+    with ProgressLine("campaign argument", unit="files", plain=not json) as progress:
+        checked = verified(file, progress.show)
     if checked.misfits:
         for one in checked.misfits:
             print(shown(f"aftbed: {file}: {one.path}: {one.why}"), file=sys.stderr)
@@ -462,7 +466,8 @@ def shrink(folder: Folder, experiment: ExperimentName, json: Json = False) -> No
     A real experiment is shrunk in the simulator, too: there a run is repeated to the last event.
     """
     before = ledger.find(_ledger(folder), experiment)
-    found = smallest(before)
+    with ProgressLine("campaign shrink", unit="runs", plain=not json) as progress:
+        found = smallest(before, progress.show)
     if json:
         print_json(found)
     else:

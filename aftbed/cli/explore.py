@@ -15,11 +15,11 @@ from aftbed.cli.options import App, Json, check_range, jobs_of, print_json, sepa
 from aftbed.cli.parsing import PlainGroup
 from aftbed.cli.request_options import RequestSource, first_requests
 from aftbed.cli.sim import described, event_lines, picture, shown_apart
-from aftbed.cli.views import progress_bar, spaced
 from aftbed.core.errors import ConfigError
 from aftbed.functions.request_file import names_function
 from aftbed.functions.source import located
 from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach
+from aftbed.report.progress import ProgressLine, spaced
 from aftbed.runtime.sim.world import Setup
 from aftbed.runtime.unix.worker_pool import once, own_seconds_max
 from aftbed.search.explore import (
@@ -138,7 +138,8 @@ def _explore(explorer: str, given: NumberedArguments) -> int:
     selection = _selection(explorer, given)
     apart = bool(selection.application)
     # How many points a run has is found by simulating it.
-    setups = once(_setups, selection, own_seconds_max(REQUESTS_MAX), apart=apart)
+    with ProgressLine(f"explore {explorer}: finding what can be struck", plain=False):
+        setups = once(_setups, selection, own_seconds_max(REQUESTS_MAX), apart=apart)
     if given.only is not None:
         if not 0 <= given.only < len(setups):
             raise ConfigError(
@@ -151,15 +152,18 @@ def _explore(explorer: str, given: NumberedArguments) -> int:
     runs, unavailable, broken, interrupted = 0, 0, list[Broken](), False
     results = explore_all(setups, jobs, lambda number, _: _command(selection, number), apart=apart)
     try:
-        with progress_bar(f"explore {explorer}", len(setups), quiet=given.json) as show, closing(results):
+        with (
+            ProgressLine(f"explore {explorer}", len(setups), "runs", plain=not given.json) as progress,
+            closing(results),
+        ):
             for number, setup, lost, breaches in results:
                 runs += 1
                 unavailable += lost and not breaches
                 if breaches:
                     broken.append(broken_one(selection, number, setup, breaches))
                     if not given.json and len(broken) <= LISTED_MAX:
-                        print(_breach_text(broken[-1]), flush=True)
-                show(runs, runs, len(broken))
+                        progress.print(_breach_text(broken[-1]))
+                progress.show(runs, note=_broken(len(broken)))
     except KeyboardInterrupt:
         interrupted = True
     result = Explored(runs, runs - len(broken), unavailable, _since(began_s), tuple(broken))
@@ -222,6 +226,10 @@ def _count(result: Explored) -> str:
     )
 
 
+def _broken(count: int) -> str:
+    return f"{spaced(count)} broken" if count else ""
+
+
 def _interrupted(runs: int, of: int) -> str:
     return f"interrupted: {spaced(runs)} of {spaced(of)} were run"
 
@@ -245,12 +253,12 @@ def order(given: ExploreOrderArguments) -> int:
     setups = list(experiments(chosen.ftms, chosen.placements, given.requests))
     interrupted = False
     try:
-        with progress_bar("explore order", len(setups), quiet=given.json) as show:
+        with ProgressLine("explore order", len(setups), "experiments", plain=not given.json) as progress:
             for one in explore_orders(setups, given.bound, jobs):
                 found.append(one)
-                show(len(found), len(found), sum(bool(o.broken) for o in found))
                 if not given.json:
-                    print(_order_text(one), flush=True)
+                    progress.print(_order_text(one))
+                progress.show(len(found), note=_broken(sum(bool(o.broken) for o in found)))
     except KeyboardInterrupt:
         interrupted = True
     orders, broken = sum(o.orders for o in found), sum(o.broken for o in found)

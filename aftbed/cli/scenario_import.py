@@ -11,6 +11,7 @@ from aftbed.core.errors import ConfigError, shown
 from aftbed.interop.openscenario.document import CAUSES, Cause
 from aftbed.interop.openscenario.folder import FileReport, import_folder
 from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, import_scenario, write
+from aftbed.report.progress import ProgressLine
 
 NOTHING_IMPORTED = 2
 
@@ -127,10 +128,11 @@ def _import_folder(
     folder: Path, options: ImportOptions, out: Path | None, *, force: bool, json: bool
 ) -> None:
     reports = []
-    for report in import_folder(folder, options, out, force=force):
-        reports.append(report)
-        if not json:
-            print(shown(_line(report)), flush=True)
+    with ProgressLine("scenario import", unit="files", plain=not json) as progress:
+        for report in import_folder(folder, options, out, force=force, show=progress.show):
+            reports.append(report)
+            if not json:
+                progress.print(shown(_line(report)))
     accepted = sum(report.accepted for report in reports)
     causes = Counter(report.cause for report in reports if report.cause is not None)
     if json:

@@ -24,7 +24,6 @@ from aftbed.cli.options import (
     takes,
 )
 from aftbed.cli.sim import read_fault
-from aftbed.cli.views import progress_bar
 from aftbed.core.errors import ConfigError
 from aftbed.core.units import milliseconds, whole_milliseconds
 from aftbed.ftm.compose import build
@@ -33,6 +32,7 @@ from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault, parse
 from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED
 from aftbed.report.plots import RoadCurve, RoadPoint, road_plot
+from aftbed.report.progress import ProgressLine
 from aftbed.search.road_table import NONE, PRIMARY, DrivenRow, RoadLine, driven, drives, outage
 from aftbed.search.worst_instant import STEP_CYCLES
 from aftbed.vehicle.scenarios import tables
@@ -145,7 +145,7 @@ def table(given: TableArguments) -> int:
     found = table_drive(given)
     began_s = time.monotonic()
     try:
-        rows = _drive(found, quiet=given.json)
+        rows = _drive(found, plain=not given.json)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
@@ -167,14 +167,18 @@ def table(given: TableArguments) -> int:
     return EXIT_CODES["pass" if struck == len(rows) else "inconclusive"]
 
 
-def _drive(found: TableDrive, *, quiet: bool) -> list[DrivenRow]:
+def _drive(found: TableDrive, *, plain: bool) -> list[DrivenRow]:
     """All rows, in the order of the lines and of the table."""
     todo = drives(found.cases, found.lines, found.seed)
     rows: dict[tuple[str, str], DrivenRow] = {}
-    with closing(driven(todo, found.jobs)) as coming, progress_bar("driving", len(todo), quiet=quiet) as show:
+    with (
+        closing(driven(todo, found.jobs)) as coming,
+        ProgressLine("scenario table", len(todo), "drives", plain=plain) as progress,
+    ):
         for done, these in enumerate(coming, 1):
             rows |= {(row.line, row.case): row for row in these}
-            show(done, len(rows), sum(not row.passed for row in rows.values()))
+            failed = sum(not row.passed for row in rows.values())
+            progress.show(done, note=f"{failed} rows fail" if failed else "")
     return [rows[line.name, case.name] for line in found.lines for case in found.cases]
 
 
