@@ -223,7 +223,12 @@ def execute(given: RunArguments) -> int:
             interrupted = _follow(launched, open_view(options, quiet=given.json), closed)
             page.close()
             launched.wait()
-            from aftbed.cli.check import judge_and_show, write_html, write_junit  # noqa: PLC0415 - after the launch
+            from aftbed.cli.check import (  # noqa: PLC0415 - after the launch
+                judge_and_show,
+                keep_verdict,
+                write_html,
+                write_junit,
+            )
             from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED  # noqa: PLC0415 - after the launch
             from aftbed.runtime.unix.trust import OWN_RUN, remember  # noqa: PLC0415 - after the launch
 
@@ -231,6 +236,8 @@ def execute(given: RunArguments) -> int:
                 text = f"aftbed check will ask for --trust: what was run cannot be remembered: {why_not}"
                 print(f"aftbed: note: {text}", file=sys.stderr)
             verdict = judge_and_show(launched.record, OWN_RUN, as_json=given.json)
+            if given.record is not None:
+                keep_verdict(launched.record, verdict)
             if launched.trouble:
                 print(f"aftbed: trouble: {launched.trouble}", file=sys.stderr)
             elif verdict.verdict == "inconclusive" and not given.json:
