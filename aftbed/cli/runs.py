@@ -48,10 +48,8 @@ def _verdict(one: ListedRun) -> str:
     match one.state:
         case ListedState.ENDED:
             return one.verdict or "not judged"
-        case ListedState.UNFINISHED:
-            return one.verdict or one.state.value
-        case ListedState.LIVE | ListedState.DAMAGED:
-            return one.state.value
+        case ListedState.UNFINISHED | ListedState.LIVE | ListedState.DAMAGED as state:
+            return str(state.value)
 
 
 def _age(one: ListedRun) -> str:

@@ -1,14 +1,14 @@
 """Which runs there are: those that live, and those whose records lie below some directories.
 
 A record is a directory with `journal/` and one of the files that a run writes beside it. Nothing of it is
-judged: its verdict is the one that its command left in `verdict.json`. Three small files are read of each.
+judged: its verdict is the one that its command left in `verdict.json`. Two small files are read of each.
 """
 
 import time
 from collections.abc import Iterable, Iterator
 from enum import Enum
 from pathlib import Path
-from typing import Final, assert_never
+from typing import Annotated, Final, assert_never
 
 import msgspec
 
@@ -20,6 +20,7 @@ from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
 
 VERDICT_NAME: Final = "verdict.json"  # in the record: the verdict of its command, as of --json
 FILE_BYTES_MAX: Final = 4_000_000
+SEED_MAX: Final = 2**63 - 1
 DEPTH_MAX: Final = 3  # below a directory: records of campaigns lie in OUT/records/ID
 FOLDERS_MAX: Final = 20_000  # that are looked into
 
@@ -64,7 +65,7 @@ class _About(msgspec.Struct, frozen=True):
     run: str
     ftm: str
     placement: str
-    seed: int
+    seed: Annotated[int, msgspec.Meta(ge=0, le=SEED_MAX)]
     work: Work
 
 

@@ -2,11 +2,14 @@
 
 import json
 import os
+import tempfile
 from pathlib import Path
 
 import msgspec
 import pytest
 from fakerun import Call, FakeRun, Output
+from hypothesis import given
+from hypothesis import strategies as st
 from liveruns import Home
 
 from aftbed.core import input_file
@@ -15,6 +18,8 @@ from aftbed.runtime.unix import run_directory
 from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
 
 DRIVE = CarRun("ccrs-50", 1.0, "latch")
+FILES = st.sampled_from(("run.json", "verdict.json"))
+KEYS = st.sampled_from(("run", "ftm", "placement", "seed", "work", "type", "scenario", "verdict"))
 
 
 def record(
@@ -88,7 +93,24 @@ def test_what_killed_runs_and_vandals_left_is_listed_as_such(folder: Path, outpu
     assert "\x1b" not in output("list")
 
 
-def test_three_small_files_are_read_of_each(
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(KEYS | st.text(), inner, max_size=6),
+)
+
+
+@given(JSON.map(lambda value: json.dumps(value).encode()) | st.binary(max_size=80), FILES)
+def test_whatever_a_file_holds_is_listed(data: bytes, name: str) -> None:
+    with tempfile.TemporaryDirectory() as above, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run_directory, "live", list)
+        made = record(Path(above) / "r")
+        (made / name).write_bytes(data)
+        (one,) = module.listed([Path(above)]).runs
+        assert one.state in (module.ListedState.ENDED, module.ListedState.DAMAGED)
+        msgspec.json.encode(one)
+
+
+def test_two_small_files_are_read_of_each(
     folder: Path, output: Output, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However large its journals are: a thousand records are a matter of a second."""
