@@ -16,10 +16,8 @@ experiment takes.
 import os
 import resource
 import signal
-import tempfile
 import time
 from collections import Counter
-from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
 from aftbed.bench.rounds import ROUNDS, InRounds, beside_limit, in_turn, shares
@@ -31,7 +29,8 @@ from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import HarnessError
 from aftbed.core.progress import Show, unshown
 from aftbed.ftm.compose import build
-from aftbed.runtime.unix import linux
+from aftbed.runtime.unix import interrupts, linux
+from aftbed.runtime.unix.interrupts import scratch_directory
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 
 FORK_SECONDS_MAX: Final = 60.0
@@ -115,9 +114,9 @@ def bench_campaign(
 
 def _carried_out(spec: Spec, jobs: int) -> _Part:
     planned = plan(spec)
-    with tempfile.TemporaryDirectory(prefix="aftbed-bench-") as folder:
+    with scratch_directory("aftbed-bench-") as folder:
         began_s, began_cpu_s = time.monotonic(), _cpu_s()
-        asked = runner.CampaignRunOptions(Path(folder) / "campaign", jobs)
+        asked = runner.CampaignRunOptions(folder / "campaign", jobs)
         results = list(runner.run(planned, asked))
         seconds, cpu_s = time.monotonic() - began_s, _cpu_s() - began_cpu_s
     if len(results) != spec.stop.experiments:
@@ -142,7 +141,7 @@ def forks_ms(processes: int, times: int, jobs: int) -> float:
 
 
 def _fork_worker(parent: int, processes: int, times: int) -> int:
-    pid = os.fork()
+    pid = interrupts.fork()
     if pid:
         return pid
     code = 1

@@ -23,7 +23,6 @@ the interval says how large it can be.
 import math
 import os
 import shlex
-import tempfile
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -37,6 +36,7 @@ from aftbed.bench.runs import TRIES, CommandFailedError, Log, run_python
 from aftbed.campaign.statistics import CONFIDENCE, Interval, quantile, quantile_interval
 from aftbed.core.errors import ConfigError, HarnessError, unknown
 from aftbed.core.progress import Show, unshown
+from aftbed.runtime.unix.interrupts import scratch_directory
 
 DEFAULT: Final = ("cycle --ftm pbr --requests 1100",)
 VERSION_SECONDS_MAX: Final = 60.0
@@ -235,9 +235,9 @@ def _python_of(venv: Path, arguments: list[str], seconds_max: float) -> bytes:
     """The output of `aftbed arguments` of that version, and no other: whatever this process imports from."""
     python = str((venv / "bin" / "python").absolute())
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
-    with tempfile.TemporaryDirectory(prefix="aftbed-bench-") as folder:
+    with scratch_directory("aftbed-bench-") as folder:
         words = ["-P", "-m", "aftbed", *arguments]
-        return run_python(words, seconds_max, python=python, folder=folder, environment=environment)
+        return run_python(words, seconds_max, python=python, folder=str(folder), environment=environment)
 
 
 def _last_line(error: CommandFailedError) -> str:

@@ -70,7 +70,7 @@ from aftbed.ftm.registry import BRICKS
 from aftbed.functions.request_file import GivenRequests
 from aftbed.functions.source import is_foreign
 from aftbed.judge.record import RunRecord
-from aftbed.runtime.unix import linux
+from aftbed.runtime.unix import interrupts, linux
 from aftbed.vehicle.aeb.function import sample_requests
 
 WARM_UP: Final = 200  # requests, and turns of the ring
@@ -264,7 +264,7 @@ def _forked(
     serve: Callable[[], None],
 ) -> int:
     """Fork a process of the ring, which keeps only its own ends and dies with `parent`."""
-    child = os.fork()
+    child = interrupts.fork()
     if child:
         return child
     try:

@@ -27,7 +27,7 @@ from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault
 from aftbed.judge.checks import failovers
-from aftbed.runtime.unix import control_client, linux
+from aftbed.runtime.unix import control_client, interrupts, linux
 
 REDUNDANCY_SECONDS_MAX: Final = 5.0
 PAUSE_SECONDS: Final = 0.02  # of undisturbed service between two kills
@@ -149,7 +149,7 @@ def death_ms(*, pin: bool = True) -> float:
 
 def _child(parent: int, work: Callable[[], None]) -> int:
     """Fork a process that does `work` and exits; it dies with `parent`."""
-    pid = os.fork()
+    pid = interrupts.fork()
     if pid == 0:
         try:
             linux.die_with(parent)

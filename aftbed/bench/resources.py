@@ -20,7 +20,6 @@ beside an interpreter that only imports typer. Each round starts all four once.
 
 import json
 import os
-import tempfile
 import time
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -47,6 +46,7 @@ from aftbed.core.progress import Show, unshown
 from aftbed.judge.record import read_record
 from aftbed.runtime.unix import control_client, linux
 from aftbed.runtime.unix.control_client import ProcessRow, measured
+from aftbed.runtime.unix.interrupts import scratch_directory
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import CarRun
 
@@ -310,8 +310,8 @@ def _start_time(values: list[float]) -> StartTime:
 
 def _launched_ms(ftm: str, placement: str) -> tuple[float, float]:
     """To the first reply, and of the graph alone."""
-    with tempfile.TemporaryDirectory(prefix="aftbed-bench-") as folder:
-        directory = Path(folder) / "record"
+    with scratch_directory("aftbed-bench-") as folder:
+        directory = folder / "record"
         began_ns = time.monotonic_ns()
         arguments = ["-m", "aftbed", "run", "--ftm", ftm, "--placement", placement, "--pace", "max"]
         run_python(

@@ -31,7 +31,7 @@ from aftbed.bench.runs import Percentiles, percentiles
 from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.progress import Show, unshown
-from aftbed.runtime.unix import linux
+from aftbed.runtime.unix import interrupts, linux
 
 ROUNDS: Final = 11  # fewer are too few to quote
 DIGITS: Final = 3  # of a ratio
@@ -78,7 +78,7 @@ def in_turn(
                 into.append(what(number))
             except (HarnessError, ConfigError):
                 failures += 1
-                if failures > failures_max:
+                if failures > failures_max or interrupts.came():
                     raise
         watch.look()
         show(len(figures) + len(limits), 2 * rounds)

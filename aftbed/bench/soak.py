@@ -21,7 +21,6 @@ import contextlib
 import os
 import resource
 import select
-import tempfile
 import time
 from bisect import bisect_left
 from collections import Counter, defaultdict
@@ -51,6 +50,7 @@ from aftbed.judge.record import read_record
 from aftbed.judge.verdict import Verdict, Word, judge
 from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.control_client import ProcessRow
+from aftbed.runtime.unix.interrupts import scratch_directory
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import LoadRun
 
@@ -202,9 +202,7 @@ def bench_soak(plan: SoakPlan, log: Log, show: Show = unshown) -> SoakResult:
     Raises HarnessError where something was not dealt with in time.
     """
     with contextlib.ExitStack() as standing:
-        folder = plan.record or str(
-            Path(standing.enter_context(tempfile.TemporaryDirectory(prefix="aftbed-bench-"))) / "record"
-        )
+        folder = plan.record or str(standing.enter_context(scratch_directory("aftbed-bench-")) / "record")
         soak = Soak(plan, folder, log, show)
         standing.callback(soak.launched.remove)
         soak.run()

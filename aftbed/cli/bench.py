@@ -15,6 +15,7 @@ from aftbed.bench.cycle import bench_cycle, bench_hops
 from aftbed.bench.recovery import bench_recovery
 from aftbed.bench.resources import bench_launch, bench_memory
 from aftbed.bench.rounds import ROUNDS, text
+from aftbed.cli.interrupted import told_if_interrupted
 from aftbed.cli.options import App, Ftm, Json, Recipe, check_range, print_json
 from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError
@@ -230,7 +231,8 @@ def soak(
 
     plan = endurance.SoakPlan(minutes, rate, crash_every, adapt_every, placement, record)
     endurance.check(plan)
-    with _measuring("soak", "s", as_json=json) as progress:
+    kept = f"the record is kept in {record}" if record is not None else "nothing is kept"
+    with told_if_interrupted(lambda: kept), _measuring("soak", "s", as_json=json) as progress:
         found = endurance.bench_soak(plan, progress.step, progress.show)
     if json:
         print_json(found)

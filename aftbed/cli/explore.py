@@ -11,6 +11,7 @@ import typer
 from msgspec.structs import replace
 
 from aftbed.cli.adapt import refuse_unsuitable
+from aftbed.cli.interrupted import interrupted
 from aftbed.cli.options import App, Json, check_range, jobs_of, print_json, separated, takes
 from aftbed.cli.parsing import PlainGroup
 from aftbed.cli.request_options import RequestSource, first_requests
@@ -18,7 +19,7 @@ from aftbed.cli.sim import described, event_lines, picture, shown_apart
 from aftbed.core.errors import ConfigError
 from aftbed.functions.request_file import names_function
 from aftbed.functions.source import located
-from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach
+from aftbed.judge.verdict import EXIT_CODES, Breach
 from aftbed.report.progress import ProgressLine, spaced
 from aftbed.runtime.sim.world import Setup
 from aftbed.runtime.unix.worker_pool import once, own_seconds_max
@@ -149,7 +150,7 @@ def _explore(explorer: str, given: NumberedArguments) -> int:
         if not apart:
             return one(given.only)
         return shown_apart(one, given.only, REQUESTS_MAX, lambda number, _: _command(selection, number))
-    runs, unavailable, broken, interrupted = 0, 0, list[Broken](), False
+    runs, unavailable, broken, stopped = 0, 0, list[Broken](), False
     results = explore_all(setups, jobs, lambda number, _: _command(selection, number), apart=apart)
     try:
         with (
@@ -165,17 +166,17 @@ def _explore(explorer: str, given: NumberedArguments) -> int:
                         progress.print(_breach_text(broken[-1]))
                 progress.show(runs, note=_broken(len(broken)))
     except KeyboardInterrupt:
-        interrupted = True
+        stopped = True
     result = Explored(runs, runs - len(broken), unavailable, _since(began_s), tuple(broken))
     if given.json:
         print_json(result)
     else:
         if len(broken) > LISTED_MAX:
             print(f"and {spaced(len(broken) - LISTED_MAX)} more; --json lists them all")
-        if runs < len(setups):
-            print(_interrupted(runs, len(setups)))
         print(_count(result))
-    return EXIT_INTERRUPTED if interrupted else EXIT_CODES["fail" if broken else "pass"]
+    if stopped:
+        return interrupted(_done(runs, len(setups)))
+    return EXIT_CODES["fail" if broken else "pass"]
 
 
 def _setups(selection: Selection) -> list[Setup]:
@@ -230,8 +231,8 @@ def _broken(count: int) -> str:
     return f"{spaced(count)} broken" if count else ""
 
 
-def _interrupted(runs: int, of: int) -> str:
-    return f"interrupted: {spaced(runs)} of {spaced(of)} were run"
+def _done(runs: int, of: int) -> str:
+    return f"{spaced(runs)} of {spaced(of)} were run; nothing is kept"
 
 
 def _since(began_s: float) -> float:
@@ -251,7 +252,7 @@ def order(given: ExploreOrderArguments) -> int:
     # The same mechanisms as those of `crash`.
     chosen = selected("crash", separated(given.ftm), separated(given.placement), given.requests)
     setups = list(experiments(chosen.ftms, chosen.placements, given.requests))
-    interrupted = False
+    stopped = False
     try:
         with ProgressLine("explore order", len(setups), "experiments", plain=not given.json) as progress:
             for one in explore_orders(setups, given.bound, jobs):
@@ -260,7 +261,7 @@ def order(given: ExploreOrderArguments) -> int:
                     progress.print(_order_text(one))
                 progress.show(len(found), note=_broken(sum(bool(o.broken) for o in found)))
     except KeyboardInterrupt:
-        interrupted = True
+        stopped = True
     orders, broken = sum(o.orders for o in found), sum(o.broken for o in found)
     complete, seconds = sum(o.complete for o in found), _since(began_s)
     if given.json:
@@ -279,13 +280,13 @@ def order(given: ExploreOrderArguments) -> int:
         }
         print_json(document)
     else:
-        if interrupted:
-            print(_interrupted(len(found), len(setups)))
         print(
             f"{spaced(orders - broken)} of {spaced(orders)} orders survived; all orders of {complete} of"
             f" {len(found)} experiments, the others up to {spaced(given.bound)} runs each; {seconds:.1f} s"
         )
-    return EXIT_INTERRUPTED if interrupted else EXIT_CODES["fail" if broken else "pass"]
+    if stopped:
+        return interrupted(_done(len(found), len(setups)))
+    return EXIT_CODES["fail" if broken else "pass"]
 
 
 def _order_text(one: OrderedRuns) -> str:

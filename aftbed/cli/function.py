@@ -76,9 +76,12 @@ def check(
 
 
 @function.command()
-def header() -> None:
+def header(json: Json = False) -> None:
     """Print the path of aft.h, which a C library includes."""
-    print(HEADER)
+    if json:
+        print_json({"header": str(HEADER)})
+    else:
+        print(HEADER)
 
 
 class _Counted:

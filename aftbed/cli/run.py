@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import msgspec
 import typer
 
+from aftbed.cli.interrupted import EXIT_INTERRUPTED
 from aftbed.cli.options import (
     RATE_HZ_MAX,
     VERIFIES,
@@ -229,7 +230,7 @@ def execute(given: RunArguments) -> int:
                 write_html,
                 write_junit,
             )
-            from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED  # noqa: PLC0415 - after the launch
+            from aftbed.judge.verdict import EXIT_CODES  # noqa: PLC0415 - after the launch
             from aftbed.runtime.unix.trust import OWN_RUN, remember  # noqa: PLC0415 - after the launch
 
             if why_not := remember(launched.record):
@@ -501,7 +502,7 @@ def _files(given: RunArguments) -> Callable[[Path], list[str]] | None:
 
     files = ExportFiles(given.mcap, given.trace)
     check(files)
-    return lambda record: export(read_record(record), files)
+    return lambda record: list(map(str, export(read_record(record), files)))
 
 
 def _written(write: Callable[[], list[str]], *, as_json: bool) -> bool:

@@ -11,9 +11,10 @@ import rich.table
 import typer
 from rich.console import Console
 
+from aftbed.cli.interrupted import interrupted
 from aftbed.cli.options import Json, Seed, check_file, check_seed, jobs_of, print_json, separated, takes
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED
+from aftbed.judge.verdict import EXIT_CODES
 from aftbed.report.plots import TimeBand, ftti_plot
 from aftbed.report.progress import ProgressLine
 from aftbed.search.ftti import (
@@ -78,8 +79,7 @@ def ftti(given: FttiArguments) -> int:
                 rows.append(margins(row, figures))
                 progress.show(len(rows))
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
+        return interrupted(f"{len(rows)} of {len(todo)} searches were done; nothing is kept")
     if given.plot is not None:
         _plot(given.plot, given.brake_policy, rows, figures)
     if given.json:

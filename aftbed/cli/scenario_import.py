@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from aftbed.cli.interrupted import told_if_interrupted
 from aftbed.cli.options import Json, print_json
 from aftbed.core.errors import ConfigError, shown
 from aftbed.interop.openscenario.document import CAUSES, Cause
@@ -127,8 +128,12 @@ def _row(imported: ImportedFile, path: str, line: int, element: str, words: str)
 def _import_folder(
     folder: Path, options: ImportOptions, out: Path | None, *, force: bool, json: bool
 ) -> None:
-    reports = []
-    with ProgressLine("scenario import", unit="files", plain=not json) as progress:
+    reports: list[FileReport] = []
+    kept = "nothing is kept" if out is None else f"their scenarios are in {out}"
+    with (
+        told_if_interrupted(lambda: f"{len(reports)} files were done; {kept}"),
+        ProgressLine("scenario import", unit="files", plain=not json) as progress,
+    ):
         for report in import_folder(folder, options, out, force=force, show=progress.show):
             reports.append(report)
             if not json:

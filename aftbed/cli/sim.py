@@ -21,6 +21,7 @@ from msgspec.structs import asdict, replace
 
 from aftbed.adapt import commands
 from aftbed.cli.adapt import refuse_unsuitable, scheduled
+from aftbed.cli.interrupted import interrupted
 from aftbed.cli.options import (
     RATE_HZ_MAX,
     SEED_MAX,
@@ -51,7 +52,7 @@ from aftbed.inject.targets import OTHERS
 from aftbed.judge.asked import not_happened
 from aftbed.judge.outcome import outcome_of
 from aftbed.judge.simulated import evidence_of_run, verdict_of
-from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach, Verdict, Word
+from aftbed.judge.verdict import EXIT_CODES, Breach, Verdict, Word
 from aftbed.report import sequence
 from aftbed.report.progress import ProgressLine, spaced
 from aftbed.runtime.sim.clock import START_NS
@@ -637,7 +638,7 @@ class _ManyRuns:
             seconds_max=seconds_max,
             apart=self._apart,
         )
-        interrupted = False
+        stopped = False
         try:
             with self._progress, closing(results):
                 for number, setup, found in results:
@@ -651,14 +652,8 @@ class _ManyRuns:
                     if seconds and took_s >= seconds:
                         break
         except KeyboardInterrupt:
-            interrupted = True
-        broken = list[BrokenRun]()
-        with ProgressLine("sim: shrinking", len(self._broken), "runs", plain=not given.json) as progress:
-            for number, (setup, found_there) in enumerate(self._broken):
-                shrinks = number < SHRUNK_MAX and not interrupted
-                again = partial(broken_run, broken=found_there, swarm=given.swarm, shrinks=shrinks)
-                broken.append(self._simulated_again(again, setup))
-                progress.show(number + 1)
+            stopped = True
+        broken = self._looked_at(shrunk_max=0 if stopped else SHRUNK_MAX)
         if given.diagram is not None and self._broken:
             broken_setup, breaches = self._broken[0]
             drawing = self._simulated_again(partial(picture, broken=breaches), broken_setup)
@@ -668,7 +663,24 @@ class _ManyRuns:
         self._show(broken, (first, first + self._runs - 1), max(took_s, 1e-9))
         proves_little = bool(self._inconclusive or self._vacuous())
         word: Word = "fail" if self._broken else "inconclusive" if proves_little else "pass"
-        return EXIT_INTERRUPTED if interrupted else EXIT_CODES[word]
+        if stopped:
+            rest = f"--seed {first + self._runs}" if seconds else f"--seeds {first + self._runs}..{last}"
+            return interrupted(f"{spaced(self._runs)} runs were done; {rest} goes on")
+        return EXIT_CODES[word]
+
+    def _looked_at(self, shrunk_max: int) -> list[BrokenRun]:
+        """The broken runs, the first few of them shrunk."""
+        if not self._broken:
+            return []
+        found = list[BrokenRun]()
+        total = len(self._broken)
+        with ProgressLine("sim: shrinking", total, "runs", plain=not self._given.json) as progress:
+            for number, (setup, broken) in enumerate(self._broken):
+                shrinks = number < shrunk_max
+                again = partial(broken_run, broken=broken, swarm=self._given.swarm, shrinks=shrinks)
+                found.append(self._simulated_again(again, setup))
+                progress.show(number + 1)
+        return found
 
     def _simulated_again(self, look: Callable[[Setup], T], setup: Setup) -> T:
         return once(look, setup, SECONDS_MAX, apart=self._apart)

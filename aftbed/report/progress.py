@@ -79,10 +79,11 @@ class ProgressLine:
 
     def show(self, done: float, total: float | None = None, note: str | None = None) -> None:
         """So much of `total` is done; `note` stands behind it. Drawn at most every REDRAW_S."""
+        is_new = total is not None and total != self._total
         self._done = done
         self._total = self._total if total is None else total
         self._note = self._note if note is None else note
-        self._look()
+        self._look(at_once=is_new)
 
     def step(self, note: str) -> None:
         """What is done next, of a few things that each take long: shown at once, also in a pipe."""

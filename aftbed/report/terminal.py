@@ -205,10 +205,20 @@ class CampaignProgress:
             from rich.live import Live  # noqa: PLC0415
 
             console = Console(stderr=True)
-            self._live = Live(
-                get_renderable=self._picture, console=console, auto_refresh=False, transient=True
+            live = Live(
+                get_renderable=self._picture,
+                console=console,
+                auto_refresh=False,
+                transient=True,
+                redirect_stdout=False,
+                redirect_stderr=False,
             )
-            self._live.start(refresh=True)
+            try:
+                live.start(refresh=True)
+            except BaseException:
+                live.stop()
+                raise
+            self._live = live
         return self
 
     def __exit__(
