@@ -9,6 +9,7 @@ from typing import Annotated, Final, NamedTuple
 import typer
 
 from aftbed import functions
+from aftbed.cli.options import Json, print_json
 from aftbed.core.errors import ConfigError, unknown
 
 NAME: Final = re.compile(r"[a-z][a-z0-9-]{0,39}")
@@ -60,12 +61,17 @@ KINDS: Final = {
 def new(
     name: Annotated[str, typer.Argument(help="Of the project, and of its new directory.")],
     kind: Annotated[str, typer.Option(help=f"What the function is: {', '.join(KINDS)}.")] = "class",
+    json: Json = False,
 ) -> None:
     """Write a project with a function, its requests, tests, a campaign and a CI workflow."""
     folder = create(name, kind)
     first = f"{KINDS[kind].first} && " if KINDS[kind].first else ""
-    typer.echo(f"{folder}/: {', '.join(sorted(_files(kind)))}")
-    typer.echo(f"next: cd {folder} && {first}pytest")
+    files, following = sorted(_files(kind)), f"cd {folder} && {first}pytest"
+    if json:
+        print_json({"directory": str(folder), "files": files, "next": following})
+    else:
+        typer.echo(f"{folder}/: {', '.join(files)}")
+        typer.echo(f"next: {following}")
 
 
 def create(name: str, kind: str) -> Path:
