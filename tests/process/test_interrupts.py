@@ -53,7 +53,7 @@ COMMANDS: Final = (
     LongCommand("bench memory", "bench memory"),
     LongCommand("bench campaign --experiments 20 --rounds 2", "1 of "),
     LongCommand("bench simulator --requests 100000 --rounds 2", "0 of "),
-    LongCommand("bench state --rounds 1000", "1 of "),
+    LongCommand("bench state --rounds 1000", "0 of "),
     LongCommand("bench soak --minutes 60 --record kept", "of 3 600 s", "the record is kept in kept"),
     LongCommand("bench all --quick", "bench all: 0 of "),
     LongCommand("bench paper --quick", "bench paper"),
