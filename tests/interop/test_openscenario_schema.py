@@ -1,6 +1,7 @@
 """The schema of OpenSCENARIO: what it refuses, with the line and what is allowed, and that it is ASAM's."""
 
 import importlib.util
+import shutil
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
@@ -116,6 +117,18 @@ def test_an_empty_act_as_in_files_of_esmini_changes_nothing(tmp_path: Path) -> N
     act = '<Story name="s"><Act name="a"></Act></Story>'
     path = beside_catalogs(tmp_path, SLOW_LEAD.read_text().replace("<StopTrigger/>", f"{act}<StopTrigger/>"))
     assert import_scenario(path, None, ImportOptions(ego="Host")).variations
+
+
+def test_an_entry_of_a_catalog_is_held_against_it(tmp_path: Path) -> None:
+    """Of the file of the catalog, with its line there."""
+    shutil.copytree(SLOW_LEAD.parent / "catalogs", tmp_path / "catalogs")
+    (cars,) = (tmp_path / "catalogs").iterdir()
+    assert 'vehicleCategory="car"' in cars.read_text()
+    heavy = 'vehicleCategory="car" mass="heavy"'
+    cars.write_text(cars.read_text().replace('vehicleCategory="car"', heavy))
+    (tmp_path / "a.xosc").write_text(SLOW_LEAD.read_text())
+    with pytest.raises(ConfigError, match=r"cars.xosc: line \d+: Vehicle: mass: found 'heavy'"):
+        import_scenario(tmp_path / "a.xosc", None, ImportOptions(ego="Host"))
 
 
 def test_what_is_ignored_is_not_held_against_it(tmp_path: Path) -> None:

@@ -393,15 +393,15 @@ class Violation(NamedTuple):
 
 
 @contextlib.contextmanager
-def fitting(root: Element) -> Iterator[None]:
-    """What is done with a whole file, or a distribution, under the schema.
+def fitting(root: Element) -> Iterator[Callable[[Element], None]]:
+    """What is done with a whole file, or a distribution; it gives what takes in entries of catalogs.
 
     Raises ConfigError with all that does not fit and is not ignored by then. That takes the place of the
     first mistake that the block has come upon, but of no other refusal.
     """
     unfit = violations(root, "OpenScenario")
     try:
-        yield
+        yield lambda entry: unfit.extend(violations(entry, entry.tag))
     except RefusedError as error:
         if error.cause is Cause.MISTAKE:
             _refuse(root, unfit)
