@@ -19,6 +19,7 @@ from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.input_file import open_input, read_input
 from aftbed.core.journal import Entry, EntryKind, History, Stored
 from aftbed.core.requirements import check_requirements
+from aftbed.ftm.compose import parse
 from aftbed.functions.request_file import ExpectedReplies
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
@@ -169,6 +170,7 @@ def read_record(path: Path, *, in_memory: bool = False) -> RunRecord:
     what = f"{path / 'run.json'}: not the options of a run"
     options = _exactly(given | {"private": "", "listener": -1, "log": -1}, RunOptions, what)
     check_requirements(f"{path / 'run.json'}: verifies", options.verifies)
+    _check_mechanism(path / "run.json", options)
     try:
         started = msgspec.convert(about.get("started_ns"), int)
     except msgspec.ValidationError as error:
@@ -202,6 +204,16 @@ def read_record(path: Path, *, in_memory: bool = False) -> RunRecord:
         given=stored_requests(path) if isinstance(work, LoadRun) and work.requests else None,
         expected=stored_replies(path) if isinstance(work, LoadRun) and work.expect else None,
     )
+
+
+def _check_mechanism(file: Path, options: RunOptions) -> None:
+    """Raise ConfigError if this installation cannot build the graph that ran, and say what it lacks."""
+    try:
+        parse(options.ftm)
+    except ConfigError as error:
+        packages = " and ".join(options.packages)
+        needed = f"; the run had it of {packages}: install that to judge it" if packages else ""
+        raise ConfigError(f"{file}: ftm: {error}{needed}") from None
 
 
 def _bus_log(log: Path, work: Work) -> tuple[int, BusLoad | None]:

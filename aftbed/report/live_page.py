@@ -44,7 +44,7 @@ import msgspec
 
 from aftbed.core.errors import AftbedError
 from aftbed.core.graph import Graph
-from aftbed.ftm.compose import EXPRESSIONS
+from aftbed.ftm.compose import expressions
 from aftbed.judge.timeline import EVENT_LOG_NAME
 from aftbed.runtime.unix import control_client, linux, run_directory
 from aftbed.runtime.unix.control_client import ProcessRow
@@ -372,7 +372,7 @@ class PageRequest(BaseHTTPRequestHandler):
         elif place == "/":
             nonce = secrets.token_urlsafe(12)
             page = resources.files("aftbed.report").joinpath("templates/live.html").read_text("utf-8")
-            options = "".join(f"<option>{expression}</option>" for expression in EXPRESSIONS)
+            options = "".join(f"<option>{expression}</option>" for expression in expressions())
             page = page.replace("MECHANISMS", options).replace("NONCE", nonce)
             self._answer(HTTPStatus.OK, "text/html", page, nonce)
         elif place == "/stream":
