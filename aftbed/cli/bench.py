@@ -124,6 +124,21 @@ def launch(
 
 
 @bench.command()
+def page(
+    ftm: Ftm = "pbr",
+    placement: Placement = "process",
+    seconds: Annotated[float, typer.Option(min=0.1, help="Of each round, with a page and without.")] = 1.0,
+    pin: Pin = True,
+    rounds: Rounds = ROUNDS,
+    json: Json = False,
+) -> None:
+    """Cycle time at the client while a live page reads the run, alternating with runs without a page."""
+    from aftbed.bench.page import bench_page  # noqa: PLC0415 - see above
+
+    _print(bench_page(ftm, placement, seconds, pin=pin, rounds=rounds), as_json=json)
+
+
+@bench.command()
 def memory(ftm: Ftm = "pbr", placement: Placement = "process", json: Json = False) -> None:
     """PSS and RSS of the graph's processes, and of all others apart."""
     with _measuring("memory", as_json=json) as progress:
