@@ -89,7 +89,10 @@ def _parameter(field: msgspec.structs.FieldInfo) -> inspect.Parameter:
     annotation, default = field.type, field.default
     kind, *about = get_args(annotation) if get_origin(annotation) is Annotated else (annotation,)
     if get_origin(kind) is tuple:
-        annotation, default = Annotated[(list[get_args(kind)[0]] | None, *about)], None  # type: ignore[misc]
+        several = list[get_args(kind)[0]]  # type: ignore[misc]
+        if default is not msgspec.NODEFAULT:
+            several, default = several | None, None  # type: ignore[assignment]
+        annotation = Annotated[(several, *about)]  # type: ignore[assignment]
     if default is msgspec.NODEFAULT:
         default = inspect.Parameter.empty
     return inspect.Parameter(

@@ -70,7 +70,8 @@ def unknown(
     `synonyms`: what words mean that others use for the same.
     """
     names = sorted(allowed)
-    meant = (synonyms or {}).get(found)
-    near = [meant] if meant in names else difflib.get_close_matches(found, names, n=1, cutoff=0.5)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
+    by_lower = {name.lower(): name for name in names}
+    meant = (synonyms or {}).get(found.lower())
+    near = [meant] if meant in names else difflib.get_close_matches(found.lower(), by_lower, n=1, cutoff=0.5)
+    hint = f"; did you mean {by_lower[near[0].lower()]!r}?" if near else ""
     return ConfigError(f"unknown {what} {found!r}{hint} (one of: {', '.join(names)})")
