@@ -30,7 +30,7 @@ import msgspec
 from msgspec import Meta
 
 from aftbed.core.application import NONE, AccessKind, Characteristics
-from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.errors import FileKeyError, unknown
 from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, parse
 from aftbed.ftm.declaration import FaultClass, Level, Suitability
 from aftbed.ftm.registry import MECHANISMS
@@ -131,15 +131,14 @@ ROWS: Final = tuple(
 TABLE: Final = SuitabilityTable({row.mechanism: row for row in ROWS})
 
 
-def table_from(file: TableFile, where: str) -> SuitabilityTable:
-    """The shipped table with the rows of `file` in it; `where` names the file. Raises ConfigError."""
+def table_from(file: TableFile) -> SuitabilityTable:
+    """The shipped table with the rows of `file` in it. Raises FileKeyError."""
     for index, row in enumerate(file.rows):
         if row.mechanism not in MECHANISMS:
-            reason = unknown("FTM", row.mechanism, MECHANISMS)
-            raise ConfigError(f"{where}: rows[{index}].mechanism: {reason}")
+            raise FileKeyError(f"rows[{index}].mechanism", unknown("FTM", row.mechanism, MECHANISMS))
     for name, times in Counter(row.mechanism for row in file.rows).items():
         if times > 1:
-            raise ConfigError(f"{where}: rows: found {times} for {name}, allowed is one")
+            raise FileKeyError("rows", f"found {times} for {name}, allowed is one")
     return SuitabilityTable(TABLE.rows | {row.mechanism: row for row in file.rows}, file.limits)
 
 

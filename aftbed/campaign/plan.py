@@ -35,7 +35,7 @@ from aftbed.campaign.spec import (
     means,
 )
 from aftbed.core.application import Characteristics
-from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.errors import ConfigError, FileKeyError, at_key, unknown
 from aftbed.ftm.compose import EXPRESSIONS, build, replication_of
 from aftbed.functions.request_file import names_function, read_requests
 from aftbed.functions.source import renamed
@@ -122,18 +122,21 @@ def plan(spec: Spec, trust: Trust = NOBODY) -> CampaignPlan:
     function declares, a function outside of this package is asked, in a process of its own, if `trust` allows
     it; otherwise nothing of it is executed.
     """
+    numbers = {entry.name: number for number, entry in enumerate(spec.faults)}  # in the file
     spec = resolved(spec, trust)
     _check_sizes(spec)
     _check_left_out(spec)
     strata = tuple(strata_of(spec))
     if not strata:
-        raise ConfigError("mechanisms: no entry of faults and adaptations is left for any of them")
+        raise FileKeyError("mechanisms", "no entry of faults and adaptations is left for any of them")
     content = msgspec.json.encode(spec, order="deterministic") + _content(spec)
     digest = hashlib.sha256(content).hexdigest()[:ID_DIGITS]
     made = CampaignPlan(spec, digest, code_version(), strata)
     for stratum in strata:
-        _check_faults(made, stratum)
-        _check_adaptations(made, stratum)
+        with at_key(f"faults[{numbers[stratum.fault.name]}].fault"):
+            _check_faults(made, stratum)
+        with at_key("adaptations"):
+            _check_adaptations(made, stratum)
     return made
 
 
@@ -179,7 +182,9 @@ def _check_sizes(spec: Spec) -> None:
         raise ConfigError(f"{strata} strata, allowed are {STRATA_MAX}")
     for entry in spec.faults:
         if (many := points(entry)) > POINTS_MAX:
-            raise ConfigError(f"faults: {entry.name!r}: a matrix of {many} points, allowed are {POINTS_MAX}")
+            raise FileKeyError(
+                "faults", f"{entry.name!r}: a matrix of {many} points, allowed are {POINTS_MAX}"
+            )
 
 
 def _check_left_out(spec: Spec) -> None:
@@ -187,9 +192,9 @@ def _check_left_out(spec: Spec) -> None:
     every = [stratum.name for stratum in strata_of(msgspec.structs.replace(spec, leave_out=()))]
     for number, pattern in enumerate(spec.leave_out):
         if every and not any(fnmatchcase(name, pattern) for name in every):
-            raise ConfigError(f"leave_out[{number}]: {unknown('stratum', pattern, every)}")
+            raise FileKeyError(f"leave_out[{number}]", unknown("stratum", pattern, every))
     if every and not any(strata_of(spec)):
-        raise ConfigError("leave_out: it leaves no stratum in")
+        raise FileKeyError("leave_out", "it leaves no stratum in")
 
 
 def _filled(entry: FaultEntry, number: int, chance: Random) -> tuple[str, ...]:
@@ -220,7 +225,7 @@ def population(entry: FaultEntry) -> int:
 
 def _check_faults(made: CampaignPlan, stratum: Stratum) -> None:
     """Every point of the matrix, before anything runs."""
-    where = f"faults: {stratum.fault.name!r} under {stratum.ftm}"
+    where = f"{stratum.fault.name!r} under {stratum.ftm}"
     system = made.spec.system
     graph = build(stratum.ftm, stratum.placement, application=system.app)
     try:
@@ -242,7 +247,7 @@ def _check_adaptations(made: CampaignPlan, stratum: Stratum) -> None:
     try:
         scheduled(stratum.adaptation.texts, graph, stratum.adaptation.recipe)
     except ConfigError as error:
-        raise ConfigError(f"adaptations: {stratum.adaptation.name!r} under {stratum.ftm}: {error}") from error
+        raise ConfigError(f"{stratum.adaptation.name!r} under {stratum.ftm}: {error}") from error
 
 
 # -- what a spec leaves to the function -----------------------------------------------------------

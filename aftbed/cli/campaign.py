@@ -21,7 +21,7 @@ from aftbed.campaign import ledger, runner
 from aftbed.campaign.experiment import REQUESTS_MAX, Result, carry_out, refuse_untrusted, smallest
 from aftbed.campaign.plan import CampaignPlan, size_of
 from aftbed.campaign.plan import plan as plan_of
-from aftbed.campaign.spec import EXPERIMENTS_MAX, Spec, check, read_spec, shipped
+from aftbed.campaign.spec import EXPERIMENTS_MAX, Spec, check, read_spec, shipped, spec_path
 from aftbed.cli.options import (
     App,
     Ftti,
@@ -36,6 +36,7 @@ from aftbed.cli.options import (
 )
 from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError, shown, unknown
+from aftbed.core.yaml_file import in_file
 from aftbed.functions.load import OWN_CODE
 from aftbed.functions.request_file import located_requests, requests_from
 from aftbed.functions.source import located
@@ -93,6 +94,14 @@ class CampaignArguments(msgspec.Struct, frozen=True, kw_only=True):
     json: Json = False
 
 
+def check_ftti(spec: Spec) -> None:
+    """Raise ConfigError if `--ftti` is no FTTI."""
+    try:
+        assert spec.ftti_ms
+    except ConfigError as error:
+        raise ConfigError(f"--{error}") from None
+
+
 def planned(given: CampaignArguments, trust: Trust = NOBODY) -> CampaignPlan:
     """The plan. Raises ConfigError before anything runs.
 
@@ -120,11 +129,10 @@ def planned(given: CampaignArguments, trust: Trust = NOBODY) -> CampaignPlan:
         spec = replace(spec, system=replace(spec.system, requests=given.count))
     if given.ftti is not None:
         spec = replace(spec, ftti=given.ftti)
-    try:
+        check_ftti(spec)
+    with in_file(spec_path(given.name)):
         check(spec)
         return plan_of(spec, trust)
-    except ConfigError as error:
-        raise ConfigError(f"{given.name}: {error}") from error
 
 
 class PlanArguments(CampaignArguments, frozen=True, kw_only=True):

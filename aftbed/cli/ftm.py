@@ -30,7 +30,7 @@ from aftbed.cli.options import Json, check_range, print_blocks, print_json
 from aftbed.core.application import NONE
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
-from aftbed.core.yaml_file import read_yaml
+from aftbed.core.yaml_file import in_file, read_yaml
 from aftbed.ftm.compose import EXPRESSIONS, build
 from aftbed.functions.source import located
 from aftbed.judge.isolated import declared_by
@@ -58,7 +58,11 @@ TableOption = Annotated[
 
 def table_of(path: str | None) -> SuitabilityTable:
     """What `--table` means. Raises ConfigError."""
-    return TABLE if path is None else table_from(read_yaml(Path(path), TableFile), path)
+    if path is None:
+        return TABLE
+    file = read_yaml(Path(path), TableFile)
+    with in_file(Path(path)):
+        return table_from(file)
 
 
 @ftm.command("list")

@@ -2,9 +2,9 @@
 
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, ClassVar, Final
 
 import msgspec
 import typer
@@ -15,7 +15,7 @@ from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.inject.bus import read_bus_fault
 from aftbed.inject.memory import refuse_unsafe
-from aftbed.inject.model import Fault, on_bus, parse, read
+from aftbed.inject.model import SYNONYMS, Fault, on_bus, parse, read
 from aftbed.inject.radar import EFFECTS, RADAR
 from aftbed.inject.value import MEMORY
 from aftbed.runtime.unix import control_client, run_directory
@@ -24,6 +24,8 @@ from aftbed.runtime.unix.options import Work, with_names_resolved
 
 class InjectGroup(PlainGroup):
     """Takes the words of a fault as one argument too, as `run --inject` does."""
+
+    MEANT: ClassVar[Mapping[str, str]] = SYNONYMS
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         whole = args and " " in args[0]

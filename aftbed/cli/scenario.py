@@ -151,7 +151,7 @@ def run(
     name: Name,
     ftm: Ftm = "pbr",
     placement: Placement = "process",
-    pace: Pace = "real",
+    pace: Pace = None,
     seed: Seed = 0,
     faults: Annotated[
         list[str] | None, typer.Option("--inject", help='E.g. "crash primary at server.enter nth 100".')

@@ -14,7 +14,6 @@ from typing import Any, Final
 
 import typer
 
-from aftbed.cli.lazy import LazyCommand
 from aftbed.core.errors import ConfigError, unknown
 
 _CLICK: Final = sys.modules[
@@ -73,7 +72,7 @@ def explained(error: Exception, ctx: Any, words: Sequence[str], kinds: Mapping[s
         return ConfigError(f"{where}{_label(error.param)} {found}: {allowed} is allowed")
     if left:
         return ConfigError(_surplus(ctx, words, left))
-    return ConfigError(f"{where}{shlex.join(words)!r} is not understood (`{ctx.command_path} --help`)")
+    return ConfigError(f"{where}{shlex.join(words)!r} is not understood (`{_help(ctx)}`)")
 
 
 def no_such_command(ctx: Any, words: Sequence[str], meant: Mapping[str, str]) -> ConfigError:
@@ -83,14 +82,22 @@ def no_such_command(ctx: Any, words: Sequence[str], meant: Mapping[str, str]) ->
     return ConfigError(f"{_where(ctx)}{unknown('command', words[0], ctx.command.commands, meant)}")
 
 
+def _names(ctx: Any) -> list[str]:
+    """The words of the command behind the name of the program, which may be `python -m aftbed`."""
+    return [] if ctx.parent is None else [*_names(ctx.parent), ctx.info_name]
+
+
 def _where(ctx: Any) -> str:
-    """The words of the command behind the name of the program."""
-    words = ctx.command_path.split()[1:]
-    return f"{' '.join(words)}: " if words else ""
+    names = _names(ctx)
+    return f"{' '.join(names)}: " if names else ""
+
+
+def _help(ctx: Any) -> str:
+    return " ".join(("aftbed", *_names(ctx), "--help"))
 
 
 def _no_such_option(ctx: Any, option: str) -> ConfigError:
-    by_help = f"{ctx.command_path} --help"
+    by_help = _help(ctx)
     reason = f"{_where(ctx)}unknown option {option!r}"
     if hasattr(ctx.command, "commands"):
         return ConfigError(f"{reason}: options stand behind a command (`{by_help}`)")
@@ -106,14 +113,16 @@ def _no_such_option(ctx: Any, option: str) -> ConfigError:
 
 def _owner(ctx: Any, option: str) -> str:
     """A command that has the option, the first in the order of the help; "" if none has."""
-    root = ctx.find_root()
-    for name, lazy in root.command.commands.items():
-        command = lazy.load() if isinstance(lazy, LazyCommand) else lazy
-        for inner, one in {"": command, **getattr(command, "commands", {})}.items():
-            leaf = one.load() if isinstance(one, LazyCommand) else one
-            if any(option in param.opts for param in leaf.params):
-                return f"{root.command_path} {name} {inner}".rstrip()
+    for name, command in ctx.find_root().command.commands.items():
+        for inner, leaf in {"": command, **getattr(_loaded(command), "commands", {})}.items():
+            if any(option in param.opts for param in _loaded(leaf).params):
+                return f"aftbed {name} {inner}".rstrip()
     return ""
+
+
+def _loaded(command: Any) -> Any:
+    """The command itself of one that is imported when it is called."""
+    return command.load() if hasattr(command, "load") else command
 
 
 def _options(ctx: Any) -> dict[str, Any]:
