@@ -7,12 +7,13 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Final, Generic, TypeVar, get_args, get_origin
+from types import GenericAlias
+from typing import Annotated, Any, Final, Generic, TypeVar, get_args, get_origin
 
 import msgspec
 import typer
 
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, shown
 from aftbed.core.requirements import check_requirements
 
 SEED_MAX: Final = 2**63 - 1
@@ -89,15 +90,23 @@ def _parameter(field: msgspec.structs.FieldInfo) -> inspect.Parameter:
     annotation, default = field.type, field.default
     kind, *about = get_args(annotation) if get_origin(annotation) is Annotated else (annotation,)
     if get_origin(kind) is tuple:
-        several = list[get_args(kind)[0]]  # type: ignore[misc]
+        several: Any = GenericAlias(list, get_args(kind)[:1])
         if default is not msgspec.NODEFAULT:
-            several, default = several | None, None  # type: ignore[assignment]
-        annotation = Annotated[(several, *about)]  # type: ignore[assignment]
+            several, default = several | None, None
+        annotation = Annotated[(several, *about)]
     if default is msgspec.NODEFAULT:
         default = inspect.Parameter.empty
     return inspect.Parameter(
         field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
     )
+
+
+def note_unusable() -> None:
+    """Where all mechanisms are listed: tell which packages have one that cannot be used, and why."""
+    from aftbed.ftm.compose import load_installed  # noqa: PLC0415 - commands without mechanisms need it not
+
+    for why in load_installed():
+        print(f"aftbed: note: {shown(why)}", file=sys.stderr)
 
 
 def separated(given: tuple[str, ...]) -> tuple[str, ...]:

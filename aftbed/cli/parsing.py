@@ -111,7 +111,7 @@ def _in_words(annotation: object) -> str:
         return ""
     if get_origin(kind) in (list, tuple):
         kind = get_args(kind)[0]
-    what = {int: "a whole number", float: "a number"}.get(kind, "")  # type: ignore[call-overload]
+    what = "a whole number" if kind is int else "a number" if kind is float else ""
     if info.min is not None:
         what += f" from {info.min:g} on" if info.max is None else f" from {info.min:g} to {info.max:g}"
     return what

@@ -9,8 +9,8 @@ import difflib
 import re
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, cast
 
 import typer
 
@@ -54,7 +54,7 @@ def explained(error: Exception, ctx: Any, words: Sequence[str], kinds: Mapping[s
     `kinds`: what the parameter of a name takes, where there is more to say than its help does.
     """
     if isinstance(error, _CLICK.NoArgsIsHelpError):
-        return error  # it is the help of a group
+        return cast("Exception", error)  # it is the help of a group
     where = _where(ctx)
     if isinstance(error, _CLICK.NoSuchOption):
         return _no_such_option(ctx, error.option_name)
@@ -196,7 +196,7 @@ def _is_expression(word: str) -> bool:
         return False
 
 
-_BY_CONTENT: Final = {  # by its option, whether a word is a value of it
+_BY_CONTENT: Final[Mapping[str, Callable[[str], bool]]] = {  # by its option, whether a word is a value of it
     "--scenario": _is_scenario,
     "--replay": lambda word: word.lower().endswith(_LOG_FILE),
     "--load": lambda word: bool(_LOAD.fullmatch(word)),

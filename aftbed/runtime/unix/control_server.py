@@ -163,6 +163,7 @@ class ControlServer:
             "busy": self._loop.tasks.names(),
             "record": self._options.record,
             "port": self._options.port,
+            "bitrate_bps": getattr(self._options.work, "bitrate_bps", None),
             "vehicle": self._work.telemetry,
             "cycle_us": self._work.cycle_us,
         }
