@@ -60,13 +60,15 @@ class PlainCommand(TyperCommand):
         if ctx.resilient_parsing or self.callback is None or (self.no_args_is_help and not args):
             raise _LeftToTyperError
         given, left, _ = self.make_parser(ctx).parse_args(args=args)
+        if left:
+            raise _LeftToTyperError
         declared = inspect.signature(self.callback).parameters
         found: dict[str, object] = {}
         for one in self.get_params(ctx):
             word = given.get(one.name)
             if one.is_eager and not word:  # help
                 continue
-            if left or one.is_eager or one.callback is not None or one.name not in declared:
+            if one.is_eager or one.callback is not None or one.name not in declared:
                 raise _LeftToTyperError
             if word is None and one.required:
                 raise _LeftToTyperError

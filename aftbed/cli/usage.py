@@ -79,7 +79,8 @@ def no_such_command(ctx: Any, words: Sequence[str], meant: Mapping[str, str]) ->
     """The first of the words is none of the group's commands. `meant`: commands by what others call them."""
     if words[0].startswith("-"):
         return _no_such_option(ctx, words[0])
-    return ConfigError(f"{_where(ctx)}{unknown('command', words[0], ctx.command.commands, meant)}")
+    known = [name for name, command in ctx.command.commands.items() if not command.hidden]
+    return ConfigError(f"{_where(ctx)}{unknown('command', words[0], known, meant)}")
 
 
 def _names(ctx: Any) -> list[str]:
@@ -113,7 +114,7 @@ def _no_such_option(ctx: Any, option: str) -> ConfigError:
 
 def _owner(ctx: Any, option: str) -> str:
     """A command that has the option, the first in the order of the help; "" if none has."""
-    for name, command in ctx.find_root().command.commands.items():
+    for name, command in getattr(ctx.find_root().command, "commands", {}).items():
         for inner, leaf in {"": command, **getattr(_loaded(command), "commands", {})}.items():
             if any(option in param.opts for param in _loaded(leaf).params):
                 return f"aftbed {name} {inner}".rstrip()
@@ -135,7 +136,7 @@ def _label(param: Any) -> str:
     """As the help names it."""
     if param.param_type_name == "option":
         return str(max(param.opts, key=len))
-    return str(param.metavar or param.name.upper())
+    return str(param.metavar or param.name)
 
 
 def _about(param: Any) -> str:

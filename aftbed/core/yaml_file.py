@@ -268,7 +268,7 @@ def _descend(node: object, allowed: inspect.Type, key: str) -> tuple[object, ins
     if (mapping := _only(allowed, inspect.DictType)) is not None:
         return value, mapping.value_type
     struct = _only(allowed, inspect.StructType)
-    fields = {field.name: field.type for field in struct.fields} if struct else {}
+    fields = {field.encode_name: field.type for field in struct.fields} if struct else {}
     return value, fields.get(key, inspect.AnyType())
 
 
@@ -289,7 +289,7 @@ def _only(allowed: inspect.Type, first: type[T], second: type[U] | None = None) 
 
 def _keys(allowed: inspect.Type) -> list[str]:
     struct = _only(allowed, inspect.StructType)
-    return [field.name for field in struct.fields] if struct else []
+    return [field.encode_name for field in struct.fields] if struct else []
 
 
 def _describe(allowed: inspect.Type) -> str:
