@@ -317,15 +317,17 @@ def _mechanisms(line: TypedLine) -> list[str]:
 
 
 def _longer(expression: str) -> list[str]:
+    """A package that brings a mechanism is imported only to see whether it composes."""
     from aftbed.ftm.compose import NONE, parse  # noqa: PLC0415
-    from aftbed.ftm.registry import MECHANISMS  # noqa: PLC0415
+    from aftbed.ftm.registry import names  # noqa: PLC0415
 
-    found = [NONE] if not expression else []
-    for name in MECHANISMS:
+    if not expression:
+        return [NONE, *names()]
+    found = list[str]()
+    for name in names():
         with contextlib.suppress(ConfigError):
-            longer = f"{expression}+{name}" if expression else name
-            parse(longer)
-            found.append(longer)
+            parse(f"{expression}+{name}")
+            found.append(f"{expression}+{name}")
     return found
 
 
@@ -578,6 +580,7 @@ VALUES: Final[Mapping[str, Values]] = {
     "--runtime": _choices_in("cli.campaign:RUNTIMES"),
     "--executor": _choices_in("cli.campaign:EXECUTORS"),
     "--kind": _choices_in("cli.new_function:KINDS"),
+    "schema kind": _choices_in("cli.schema:SHAPES"),
     "log convert --from": _names_of(_log_formats),
     "log convert --to": _names_of(_log_formats),
     "--app": _files,

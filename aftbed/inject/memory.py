@@ -9,7 +9,7 @@ is lost with the process. How the memory of another process is reached is in `ru
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final, Self
 
 from aftbed.core.errors import ConfigError, StepFailed
@@ -53,6 +53,12 @@ class MemoryFlip(FaultKind, frozen=True, tag="memory"):
     @classmethod
     def subjects(cls, graph: Graph) -> tuple[str, ...]:
         return (MEMORY,)
+
+    @classmethod
+    def next_words(cls, words: Sequence[str], graph: Graph) -> Iterable[str]:
+        if words[-1] == "in":
+            return (*targets.roles_in(graph), *graph.nodes)
+        return super().next_words(words, graph)
 
     def subject(self, target: str) -> list[str]:
         bit = "" if self.bit is None else f"bit {self.bit}"

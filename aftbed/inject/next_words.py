@@ -20,18 +20,18 @@ EXCLUSIVE: Final = (  # of each row, one key at most
     (PERMANENT, INTERMITTENT, FOR),
     ("by", "share"),
 )
-EXAMPLES: Final = {  # values that nothing lists: some of the size that is usual
+EXAMPLES: Final = {  # values that nothing lists: usual ones, which fit any kind of fault
     "nth": ("1", "10", "100"),
     "after": ("200ms", "2s"),
     FOR: ("50ms", "500ms"),
     "by": ("2ms", "20ms"),
     "share": ("25%", "50%"),
-    "bit": ("0", "52"),
+    "bit": ("0", "7"),
     "bits": ("2", "3"),
-    BYTE: ("0", "7"),
+    BYTE: ("0",),
     "burst": ("3", "8"),
-    "stuck": ("60=0", "60=1"),
-    "address": ("0x",),
+    "stuck": ("7=0", "7=1"),
+    "address": ("0x7f0012345678",),
     "range": ("30", "40"),
     "speed": ("10",),
     "angle": ("20",),

@@ -55,7 +55,7 @@ def test_every_command_is_offered_and_takes_its_options() -> None:
         if inner:
             assert offered(*words, "") == inner, path
         options = [name for one in command.params if one.param_type_name == "option" for name in one.opts]
-    XX
+        assert {*options, "--help"} <= set(offered(*words, "-")), path
 
 
 def test_each_kind_of_value_belongs_to_an_option_or_an_argument_that_there_is() -> None:

@@ -8,6 +8,7 @@ import pytest
 from packages import install, install_new
 
 from aftbed.adapt.suitability import AMPLE, FaultModel, problems
+from aftbed.cli.completer import complete
 from aftbed.core import installed
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError
@@ -61,6 +62,14 @@ def test_a_name_is_found_without_the_others(limit: str, site: Path) -> None:
     install(site, "other", {"other": "other_module:X"}, other_module="raise AssertionError('imported')")
     assert parse("pbr+limit") == ("pbr", "limit")
     assert "other_module" not in sys.modules
+
+
+def test_a_shell_completes_it_as_ours(limit: str, site: Path) -> None:
+    install(site, "other", {"other": "other_module:X"}, other_module="raise ImportError('broken')")
+    assert {"pbr", "limit", "other"} <= {word for word, _ in complete(["run", "--ftm", ""]).words}
+    inside = [word for word, _ in complete(["run", "--ftm", "pbr+l"]).words]
+    assert inside[0] == "pbr+limit" and "pbr+limit+tr" in inside
+    assert complete(["run", "--ftm", "pbr+o"]).words == []
 
 
 def test_for_our_mechanisms_no_package_is_looked_at(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
