@@ -43,7 +43,7 @@ SUBCOMMANDS: Final[CommandTable] = {
         "Which changes of FT, A and R a set of mechanisms answers: by staying, by an adaptation, by nothing.",
     ),
 }
-ftm = typer.Typer(cls=group_of(SUBCOMMANDS))
+ftm = typer.Typer(cls=group_of(SUBCOMMANDS, "ftm"))
 EXIT_INCONSISTENT: Final = 1
 CPUS_MAX: Final = 1024
 BANDWIDTH_KBIT_S_MAX: Final = 1e9

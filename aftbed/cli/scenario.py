@@ -31,7 +31,7 @@ SUBCOMMANDS: Final[CommandTable] = {
     ),
 }
 
-scenario = typer.Typer(cls=group_of(SUBCOMMANDS))
+scenario = typer.Typer(cls=group_of(SUBCOMMANDS, "scenario"))
 
 Name = Annotated[str, typer.Argument(help="A scenario, a row of a table (r152:m1-60), or a YAML file.")]
 

@@ -43,6 +43,7 @@ def test_the_help_of_all_commands_imports_no_command() -> None:
         "aftbed",
         "aftbed.cli",
         "aftbed.cli.app",
+        "aftbed.cli.examples",
         "aftbed.cli.lazy",
         "aftbed.cli.parsing",
         "aftbed.core",
