@@ -21,7 +21,7 @@ from aftbed.adapt.planner import APPLICATION, Plan, target
 from aftbed.adapt.planner import plan as plan_between
 from aftbed.adapt.script_file import ScriptFile, entry, mapping, phases, script_from
 from aftbed.adapt.suitability import remarks, unsuitable
-from aftbed.cli.options import Json, Recipe, Run, class_source, print_json, takes
+from aftbed.cli.options import Json, Recipe, Run, choices, class_source, print_json, takes
 from aftbed.cli.parsing import PlainGroup
 from aftbed.cli.views import EndedAdaptation, history_lines
 from aftbed.core.application import Characteristics
@@ -272,7 +272,7 @@ def plan(
         str | None, typer.Option("--from", help="From this mechanism; without it, from what runs.")
     ] = None,
     placement: Annotated[
-        str | None, typer.Option(help="With --from: process (default), replica or single.")
+        str | None, typer.Option(metavar=choices(PLACEMENTS), help="With --from; process if left out.")
     ] = None,
     recipe: Recipe = "drained",
     run: Run = None,

@@ -30,6 +30,7 @@ from aftbed.cli.options import (
     TrustedFolders,
     check_file,
     check_range,
+    choices,
     jobs_of,
     print_json,
     takes,
@@ -84,7 +85,9 @@ class CampaignArguments(msgspec.Struct, frozen=True, kw_only=True):
     experiments: Annotated[
         int | None, typer.Option("--experiments", help="In each stratum; overrides that of the file.")
     ] = None
-    runtime: Annotated[str | None, typer.Option(help="unix or sim; overrides that of the file.")] = None
+    runtime: Annotated[
+        str | None, typer.Option(metavar=choices(RUNTIMES), help="Overrides that of the file.")
+    ] = None
     app: App = None
     requests: Requests = None
     count: Annotated[
@@ -193,9 +196,9 @@ class CampaignRunArguments(CampaignArguments, frozen=True, kw_only=True):
     resume: Annotated[bool, typer.Option("--resume", help="Run only what is missing in the directory.")] = (
         False
     )
-    executor: Annotated[str, typer.Option(help="local processes, or dask (needs --scheduler).")] = EXECUTORS[
-        0
-    ]
+    executor: Annotated[
+        str, typer.Option(metavar=choices(EXECUTORS), help="local processes, or dask (needs --scheduler).")
+    ] = EXECUTORS[0]
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler.")] = None
 
 

@@ -1,4 +1,4 @@
-"""Below the help of each command: one or two command lines that work. tests/cli/test_examples.py parses them."""
+"""Below the help of each command: command lines that it takes, which tests/cli/test_examples.py parses."""
 
 from collections.abc import Mapping
 from typing import Final

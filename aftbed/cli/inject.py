@@ -10,7 +10,7 @@ import msgspec
 import typer
 from msgspec.structs import asdict, replace
 
-from aftbed.cli.options import Run, takes
+from aftbed.cli.options import Run, choices, takes
 from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.inject.bus import read_bus_fault
@@ -62,7 +62,7 @@ At = Annotated[str | None, typer.Option(help="Event to strike at, as checkpoint.
 Nth = Annotated[str | None, typer.Option(help="Which occurrence of the event, counted from now.")]
 After = Annotated[str | None, typer.Option(help="How long from now, as 200ms.")]
 When = Annotated[str | None, typer.Option(help='At a state of the car, as "ttc < 1.2": ttc, gap or speed.')]
-Replica = Annotated[str | None, typer.Option(help="primary (default), backup, a or b.")]
+Replica = Annotated[str | None, typer.Option(metavar="<primary|backup|a|b>", help="primary if left out.")]
 Permanent = Annotated[bool, typer.Option("--permanent", help="Each time from the first strike on.")]
 Every = Annotated[str | None, typer.Option(help="Each Nth time from the first strike on.")]
 Chance = Annotated[str | None, typer.Option(help="Each time with this chance, as 0.1; seeded.")]
@@ -139,7 +139,9 @@ class BitflipArguments(msgspec.Struct, frozen=True, kw_only=True):
     byte: Annotated[str | None, typer.Option(help="All of this byte, or of a `drawn` one.")] = None
     burst: Annotated[str | None, typer.Option(help="So many bits side by side, from --bit on.")] = None
     stuck: Annotated[str | None, typer.Option(help="A bit and its value, as 60=1.")] = None
-    level: Annotated[str, typer.Option(help="value, or memory: any byte of a process.")] = "value"
+    level: Annotated[
+        str, typer.Option(metavar=choices(LEVELS), help="value, or memory: any byte of a process.")
+    ] = "value"
     address: Annotated[
         str | None,
         typer.Option(help="With --level memory: address of the byte, as 0x7f00; drawn if left out."),

@@ -5,7 +5,7 @@ import inspect
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import GenericAlias
 from typing import Annotated, Any, Final, Generic, TypeVar, get_args, get_origin
@@ -15,6 +15,7 @@ import typer
 
 from aftbed.core.errors import ConfigError, shown
 from aftbed.core.requirements import check_requirements
+from aftbed.core.script import RECIPES
 
 SEED_MAX: Final = 2**63 - 1
 RATE_HZ_MAX: Final = 100_000.0
@@ -51,7 +52,17 @@ TrustedFolders = Annotated[
     list[Path] | None,
     typer.Option("--trust", help="Directory whose functions may be executed; may be given several times."),
 ]
-Recipe = Annotated[str, typer.Option(help="drained, or paper: SIGSTOP, kill, launch, link, SIGCONT.")]
+
+
+def choices(names: Iterable[str]) -> str:
+    """As the help shows what an option allows."""
+    return f"<{'|'.join(names)}>"
+
+
+Recipe = Annotated[
+    str,
+    typer.Option(metavar=choices(RECIPES), help="drained, or paper: SIGSTOP, kill, launch, link, SIGCONT."),
+]
 
 Arguments = TypeVar("Arguments", bound=msgspec.Struct)
 

@@ -36,12 +36,13 @@ from aftbed.cli.options import (
     check_file,
     check_range,
     check_seed,
+    choices,
     requirements,
     takes,
 )
 from aftbed.cli.views import RunView, open_view
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.graph import Graph
+from aftbed.core.graph import PLACEMENTS, Graph
 from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.core.units import whole_milliseconds
@@ -66,8 +67,13 @@ LOAD_MAX: Final = 10_000_000
 PROCESSES_LOG_SHOWN: Final = 4000  # characters
 
 
-Placement = Annotated[str, typer.Option(help="process (one per brick) or replica.")]
-Pace = Annotated[str | None, typer.Option(show_default="real", help="real, a factor (4), or max (lockstep).")]
+Placement = Annotated[
+    str,
+    typer.Option(metavar=choices(PLACEMENTS), help="Which bricks share a process: none, a replica's, all."),
+]
+Pace = Annotated[
+    str | None, typer.Option(show_default="real", metavar="<real|max|FACTOR>", help="As 4; max is lockstep.")
+]
 
 
 class RunArguments(msgspec.Struct, frozen=True):
@@ -87,9 +93,9 @@ class RunArguments(msgspec.Struct, frozen=True):
     adaptations: Annotated[
         tuple[str, ...], typer.Option("--adapt", help='E.g. "compose lfr+tr at request 120".')
     ] = ()
-    recipe: Annotated[str, typer.Option(help="How each --adapt is carried out: drained or paper.")] = (
-        "drained"
-    )
+    recipe: Annotated[
+        str, typer.Option(metavar=choices(RECIPES), help="How each --adapt is carried out.")
+    ] = "drained"
     force: Annotated[
         bool, typer.Option("--force", help="Run, and --adapt, even where it does not suit the function.")
     ] = False
@@ -99,12 +105,15 @@ class RunArguments(msgspec.Struct, frozen=True):
     policy: Annotated[
         str | None, typer.Option(help="When the run adapts by itself: name of a policy, or a YAML file.")
     ] = None
-    approve: Annotated[str, typer.Option(help="What --policy proposes: auto (do it) or ask.")] = "auto"
+    approve: Annotated[
+        str, typer.Option(metavar="<auto|ask>", help="What --policy proposes: do it, or ask.")
+    ] = "auto"
     brake_policy: Annotated[
         str | None,
         typer.Option(
             show_default=POLICIES[-1],
-            help="What the brake ECU does on lost requests: hold, release or latch.",
+            metavar=choices(POLICIES),
+            help="What the brake ECU does on lost requests.",
         ),
     ] = None
     record: Annotated[str | None, typer.Option(help="Keep the record of the run in this new directory.")] = (

@@ -31,7 +31,7 @@ _OPTIONS_MEANT: Final = {  # by what others call them
     "-j": "--jobs",
     "-n": "--count",
     "--fault": "--inject",
-    "--faults": "--inject",
+    "--faults": "--inject",  # as `aftbed sim` called it
     "--mechanism": "--ftm",
     "--output": "--out",
     "--parallel": "--jobs",

@@ -77,7 +77,7 @@ def test_a_row_that_fails_is_exit_code_1_and_says_why(table: Call, tmp_path: Pat
     assert code == 1
     assert "none, crash primary at server.enter nth 100" in out.splitlines()
     assert "  ncap:ccrb-12m-6-50: impact at " in out
-    assert f'  repeat  aftbed sim --scenario ncap:ccrb-12m-6-50 --ftm none --seed 0 --faults "{fault}"' in out
+    assert f'  repeat  aftbed sim --scenario ncap:ccrb-12m-6-50 --ftm none --seed 0 --inject "{fault}"' in out
     assert "0 of 1 rows pass" in out
 
 
