@@ -23,6 +23,7 @@ root_doc = "README"
 include_patterns = ["README.md", "CHANGELOG.md", "docs/*.md"]
 exclude_patterns = [".*", "build", "dist"]
 myst_heading_anchors = 4  # as code hosts name them, so that one link leads to both
+smartquotes = False
 suppress_warnings = ["misc.highlighting_failure"]  # a shortened JSON or YAML is still coloured
 
 html_theme = "furo"

@@ -6,7 +6,7 @@ import msgspec
 import typer
 
 from aftbed.cli.options import Json, Run, choices, print_json
-from aftbed.core.errors import unknown
+from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import PLACEMENTS, Graph
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix import control_client, run_directory
@@ -37,11 +37,14 @@ def ps(run: Run = None, json: Json = False) -> None:
     print(f"{len(nodes_mb)} processes, {sum(nodes_mb):.1f} MB; {len(rows) - len(nodes_mb)} beside")
 
 
-def stop(run: Run = None) -> None:
+def stop(run: Run = None, json: Json = False) -> None:
     """End a live run; its command prints the verdict so far."""
     private = run_directory.find(run)
     control_client.ask(private, control_client.StopCommand())
-    print(f"run {private.name}: stopping")
+    if json:
+        print_json({"run": private.name, "stopping": True})
+    else:
+        print(f"run {private.name}: stopping")
 
 
 # -- graph ----------------------------------------------------------------------------------------
@@ -59,8 +62,11 @@ def graph(
         ),
     ] = "text",
     run: Run = None,
+    json: Json = False,
 ) -> None:
     """The bricks, their channels and their nodes."""
+    if json and style != "text":
+        raise ConfigError(f"--json and --format {style}: one of them is allowed")
     if style not in FORMATS:
         raise unknown("format", style, FORMATS)
     if ftm is not None:
@@ -69,7 +75,10 @@ def graph(
         shown = msgspec.convert(
             control_client.ask(run_directory.find(run), control_client.GraphQuery()), Graph
         )
-    print(FORMATS[style](shown))
+    if json:
+        print_json(shown)
+    else:
+        print(FORMATS[style](shown))
 
 
 def _text(graph: Graph) -> str:

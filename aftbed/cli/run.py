@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import msgspec
 import typer
 
+from aftbed.cli.interrupted import EXIT_INTERRUPTED
 from aftbed.cli.options import (
     RATE_HZ_MAX,
     VERIFIES,
@@ -244,14 +245,21 @@ def execute(given: RunArguments) -> int:
             interrupted = _follow(launched, open_view(options, quiet=given.json), closed)
             page.close()
             launched.wait()
-            from aftbed.cli.check import judge_and_show, write_html, write_junit  # noqa: PLC0415 - after the launch
-            from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED  # noqa: PLC0415 - after the launch
+            from aftbed.cli.check import (  # noqa: PLC0415 - after the launch
+                judge_and_show,
+                keep_verdict,
+                write_html,
+                write_junit,
+            )
+            from aftbed.judge.verdict import EXIT_CODES  # noqa: PLC0415 - after the launch
             from aftbed.runtime.unix.trust import OWN_RUN, remember  # noqa: PLC0415 - after the launch
 
             if why_not := remember(launched.record):
                 text = f"aftbed check will ask for --trust: what was run cannot be remembered: {why_not}"
                 print(f"aftbed: note: {text}", file=sys.stderr)
             verdict = judge_and_show(launched.record, OWN_RUN, as_json=given.json)
+            if given.record is not None:
+                keep_verdict(launched.record, verdict)
             if launched.trouble:
                 print(f"aftbed: trouble: {launched.trouble}", file=sys.stderr)
             elif verdict.verdict == "inconclusive" and not given.json:
@@ -515,7 +523,7 @@ def _files(given: RunArguments) -> Callable[[Path], list[str]] | None:
 
     files = ExportFiles(given.mcap, given.trace)
     check(files)
-    return lambda record: export(read_record(record), files)
+    return lambda record: list(map(str, export(read_record(record), files)))
 
 
 def _written(write: Callable[[], list[str]], *, as_json: bool) -> bool:

@@ -111,7 +111,19 @@ def tmux(*words: str) -> str:
 def terminal_of(words: list[str]) -> Iterator[Callable[[], str]]:
     """Run `words` in a terminal. Gives what its screen shows, with its colours."""
     size = ("-x", str(COLUMNS), "-y", str(LINES))
-    tmux("new-session", "-d", *size, "env", "TERM=xterm-256color", "COLORTERM=truecolor", *words)
+    kept = ("set-option", "-g", "remain-on-exit", "on", ";")  # the last words of a run that fails
+    tmux(
+        "start-server",
+        ";",
+        *kept,
+        "new-session",
+        "-d",
+        *size,
+        "env",
+        "TERM=xterm-256color",
+        "COLORTERM=truecolor",
+        *words,
+    )
     try:
         yield lambda: tmux("capture-pane", "-e", "-p")
     finally:
@@ -121,7 +133,7 @@ def terminal_of(words: list[str]) -> Iterator[Callable[[], str]]:
 def until(screen: Callable[[], str], wanted: Callable[[str], bool]) -> str:
     limit = time.monotonic() + SECONDS_MAX
     while not wanted(shown := screen()):
-        assert time.monotonic() < limit, f"never shown: {shown}"
+        assert time.monotonic() < limit and "Pane is dead" not in shown, f"never shown: {shown}"
         time.sleep(0.05)
     return shown
 
