@@ -148,9 +148,8 @@ def test_files_are_looked_up_beside_the_campaign_and_then_here(
         (CRASHES.replace("system: {", "system: {app: my.py:Sum, "), "app", "my.py"),
     ):
         found = refusal(beside, text)
-        told = (
-            f"try.yaml: system.{key}: .*/beside/{name}: no such file, beside the campaign file or in {here}$"
-        )
+        where = rf"try.yaml: line 4, column \d+: system.{key}: .*/beside/{name}"
+        told = f"{where}: no such file, beside the campaign file or in {here}$"
         assert re.search(told, found), found
     for folder in (here, beside):  # what is beside the file comes first
         (folder / "roads").mkdir()
