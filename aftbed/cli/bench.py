@@ -16,9 +16,10 @@ from aftbed.bench.recovery import bench_recovery
 from aftbed.bench.resources import bench_launch, bench_memory
 from aftbed.bench.rounds import ROUNDS, text
 from aftbed.cli.interrupted import told_if_interrupted
-from aftbed.cli.options import App, Ftm, Json, Recipe, check_range, print_json
+from aftbed.cli.options import App, Ftm, Json, Recipe, check_range, choices, print_json
 from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError
+from aftbed.core.graph import PLACEMENTS
 from aftbed.ftm.compose import DUPLEX, replication_of
 from aftbed.functions.load import OWN_CODE
 from aftbed.functions.request_file import located_requests, requests_from
@@ -30,7 +31,7 @@ REQUESTS_MIN: Final = 5000
 SENT_FUNCTION: Final = 512  # requests of MODULE:FUNCTION, sent in turn
 KILLS_MIN: Final = 1
 
-Placement = Annotated[str, typer.Option(help="process, replica or single.")]
+Placement = Annotated[str, typer.Option(metavar=choices(PLACEMENTS), help="Which bricks share a process.")]
 Rounds = Annotated[
     int, typer.Option(min=1, help=f"Of figure and limit in turn; below {ROUNDS} they are too few to quote.")
 ]

@@ -5,9 +5,9 @@ from typing import Annotated, Final
 import msgspec
 import typer
 
-from aftbed.cli.options import Json, Run, print_json
+from aftbed.cli.options import Json, Run, choices, print_json
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.graph import Graph
+from aftbed.core.graph import PLACEMENTS, Graph
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix import control_client, run_directory
 from aftbed.runtime.unix.control_client import measured
@@ -52,8 +52,15 @@ def stop(run: Run = None, json: Json = False) -> None:
 
 def graph(
     ftm: Annotated[str | None, typer.Option(help="Show this FTM's graph; without it, a live run's.")] = None,
-    placement: Annotated[str, typer.Option(help="With --ftm: process or replica.")] = "process",
-    style: Annotated[str, typer.Option("--format", help="text, dot or mermaid.")] = "text",
+    placement: Annotated[
+        str, typer.Option(metavar=choices(PLACEMENTS), help="With --ftm: which bricks share a process.")
+    ] = "process",
+    style: Annotated[
+        str,
+        typer.Option(
+            "--format", metavar="<text|dot|mermaid>", help="Of Graphviz, or for a page in Markdown."
+        ),
+    ] = "text",
     run: Run = None,
     json: Json = False,
 ) -> None:

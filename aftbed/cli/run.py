@@ -37,12 +37,13 @@ from aftbed.cli.options import (
     check_file,
     check_range,
     check_seed,
+    choices,
     requirements,
     takes,
 )
 from aftbed.cli.views import RunView, open_view
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.graph import Graph
+from aftbed.core.graph import PLACEMENTS, Graph
 from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.core.units import whole_milliseconds
@@ -60,24 +61,32 @@ if TYPE_CHECKING:
     from aftbed.functions.request_file import GivenRequests
     from aftbed.runtime.unix.closed_loop import ClosedLoop
 
-POLICIES: Final = ("hold", "release", "latch")
+POLICIES: Final = ("hold", "release", "latch")  # the last one if left out
+SCENARIO: Final = "ccrs-50"  # if left out
 PACE_MIN, PACE_MAX = 0.01, 100.0
 LOAD_MAX: Final = 10_000_000
 PROCESSES_LOG_SHOWN: Final = 4000  # characters
 
 
-Placement = Annotated[str, typer.Option(help="process (one per brick) or replica.")]
-Pace = Annotated[str, typer.Option(help="real, a factor (4), or max (lockstep).")]
+Placement = Annotated[
+    str,
+    typer.Option(metavar=choices(PLACEMENTS), help="Which bricks share a process: none, a replica's, all."),
+]
+Pace = Annotated[
+    str | None, typer.Option(show_default="real", metavar="<real|max|FACTOR>", help="As 4; max is lockstep.")
+]
 
 
 class RunArguments(msgspec.Struct, frozen=True):
     """The options of `aftbed run`."""
 
     ftm: Ftm = "pbr"
-    scenario: Annotated[str, typer.Option(help="Name of a scenario, or a YAML file.")] = "ccrs-50"
+    scenario: Annotated[
+        str | None, typer.Option(show_default=SCENARIO, help="Name of a scenario, or a YAML file.")
+    ] = None
     app: App = None
     placement: Placement = "process"
-    pace: Pace = "real"
+    pace: Pace = None
     seed: Annotated[int, typer.Option(help="Seed of all random numbers of the run.")] = 0
     faults: Annotated[
         tuple[str, ...], typer.Option("--inject", help='E.g. "crash primary at checkpoint.sent nth 100".')
@@ -85,9 +94,9 @@ class RunArguments(msgspec.Struct, frozen=True):
     adaptations: Annotated[
         tuple[str, ...], typer.Option("--adapt", help='E.g. "compose lfr+tr at request 120".')
     ] = ()
-    recipe: Annotated[str, typer.Option(help="How each --adapt is carried out: drained or paper.")] = (
-        "drained"
-    )
+    recipe: Annotated[
+        str, typer.Option(metavar=choices(RECIPES), help="How each --adapt is carried out.")
+    ] = "drained"
     force: Annotated[
         bool, typer.Option("--force", help="Run, and --adapt, even where it does not suit the function.")
     ] = False
@@ -97,10 +106,17 @@ class RunArguments(msgspec.Struct, frozen=True):
     policy: Annotated[
         str | None, typer.Option(help="When the run adapts by itself: name of a policy, or a YAML file.")
     ] = None
-    approve: Annotated[str, typer.Option(help="What --policy proposes: auto (do it) or ask.")] = "auto"
+    approve: Annotated[
+        str, typer.Option(metavar="<auto|ask>", help="What --policy proposes: do it, or ask.")
+    ] = "auto"
     brake_policy: Annotated[
-        str, typer.Option(help="What the brake ECU does on lost requests: hold, release or latch.")
-    ] = "latch"
+        str | None,
+        typer.Option(
+            show_default=POLICIES[-1],
+            metavar=choices(POLICIES),
+            help="What the brake ECU does on lost requests.",
+        ),
+    ] = None
     record: Annotated[str | None, typer.Option(help="Keep the record of the run in this new directory.")] = (
         None
     )
@@ -328,12 +344,13 @@ def _work(given: RunArguments) -> Work:
         files = _replay_files(given.replay, given.dbc, given.map_file)
         return ReplayRun(*files, pace, given.loop, duration_ms, given.bitrate)
     _refuse(given, OF_A_REPLAY, "only with --replay LOG: leave out")
-    if given.brake_policy not in POLICIES:
-        raise unknown("brake policy", given.brake_policy, POLICIES)
-    scenario = given.scenario
+    brake_policy = POLICIES[-1] if given.brake_policy is None else given.brake_policy
+    if brake_policy not in POLICIES:
+        raise unknown("brake policy", brake_policy, POLICIES)
+    scenario = SCENARIO if given.scenario is None else given.scenario
     if scenario.endswith((".yaml", ".yml")):
         scenario = str(Path(scenario).resolve())
-    return CarRun(scenario, pace, given.brake_policy, duration_ms, given.bitrate)
+    return CarRun(scenario, pace, brake_policy, duration_ms, given.bitrate)
 
 
 def _replay_files(log: str, dbc_name: str | None, map_name: str | None) -> tuple[str, str, str]:
@@ -360,11 +377,11 @@ def _log(given: RunArguments) -> bytes | None:
     return msgspec.msgpack.encode(read_for_replay(Path(given.replay), skip_bad=given.skip_bad))
 
 
-def _pace(text: str) -> float | None:
+def _pace(text: str | None) -> float | None:
     """The pace as a factor; None is lockstep."""
     if text == "max":
         return None
-    if text == "real":
+    if text is None or text == "real":
         return 1.0
     try:
         pace = float(text)
@@ -376,9 +393,9 @@ def _pace(text: str) -> float | None:
 
 
 def _load(text: str) -> LoadRun:
-    count, _, rate = text.partition("@")
+    count, at, rate = text.partition("@")
     try:
-        load = LoadRun(int(count), float(rate or 0))
+        load = LoadRun(int(count), float(rate) if at else 0.0)
     except ValueError:
         load = LoadRun(0, 0.0)
     if not (1 <= load.count <= LOAD_MAX and 0 <= load.rate_hz <= RATE_HZ_MAX):

@@ -28,7 +28,7 @@ from typing import Any, Final
 
 import msgspec
 
-from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.errors import ConfigError, FileKeyError, unknown
 from aftbed.interop.files import write_text_whole
 from aftbed.interop.openscenario.catalog import Catalogs
 from aftbed.interop.openscenario.document import (
@@ -335,7 +335,9 @@ def _scenario_file(name: str, drive: ImportedDrive, description: str, expect: st
     keys["road"] = {"friction": drive.friction}
     keys["expect"] = {"outcome": expect}
     try:
-        scenario_of(name, name, msgspec.convert(keys, ScenarioKeys))
+        scenario_of(name, msgspec.convert(keys, ScenarioKeys))
+    except FileKeyError as error:
+        raise ConfigError(f"{name}: {error}") from error
     except msgspec.ValidationError as error:
         reason = f"the scenario would be out of range: {error}"
         raise RefusedError(f"{path}: {reason}", str(path), 0, reason, Cause.RANGE) from error

@@ -55,7 +55,7 @@ from aftbed.adapt.policy import (
 from aftbed.adapt.suitability import unsuitable
 from aftbed.core import journal
 from aftbed.core.application import Characteristics
-from aftbed.core.errors import AftbedError, ConfigError, PeerError, unknown
+from aftbed.core.errors import AftbedError, ConfigError, FileKeyError, PeerError, unknown
 from aftbed.core.input_file import read_input
 from aftbed.core.journal import Record
 from aftbed.core.messages import Goal
@@ -136,7 +136,7 @@ def policy_names() -> list[str]:
 
 def load_policy(name_or_path: str) -> Policy:
     """A shipped policy by name, or a file by path: whatever has a slash or ends in .yaml or .yml."""
-    from aftbed.core.yaml_file import read_yaml  # noqa: PLC0415 - PyYAML costs 15 ms
+    from aftbed.core.yaml_file import in_file, read_yaml  # noqa: PLC0415 - PyYAML costs 15 ms
 
     if "/" in name_or_path or name_or_path.endswith((".yaml", ".yml")):
         path = Path(name_or_path)
@@ -144,13 +144,15 @@ def load_policy(name_or_path: str) -> Policy:
         path = _FOLDER / f"{name_or_path}.yaml"
     else:
         raise unknown("policy", name_or_path, policy_names())
-    policy = policy_from(read_yaml(path, PolicyFile), str(path))
-    for rule in policy.rules:
-        if isinstance(rule.when, Beyond) and rule.when.resource not in MEASURED:
-            raise ConfigError(
-                f"{path}: {rule.key}.when.resource: found {rule.when.resource}, which no run measures;"
-                f" measured are: {', '.join(MEASURED)}"
-            )
+    file = read_yaml(path, PolicyFile)
+    with in_file(path):
+        policy = policy_from(file)
+        for rule in policy.rules:
+            if isinstance(rule.when, Beyond) and rule.when.resource not in MEASURED:
+                raise FileKeyError(
+                    f"{rule.key}.when.resource",
+                    f"found {rule.when.resource}, which no run measures; measured are: {', '.join(MEASURED)}",
+                )
     return policy
 
 
