@@ -15,7 +15,7 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Final
@@ -241,9 +241,15 @@ def waited_ns(pid: int) -> int:
 
 def ends(pidfd: int, seconds: float) -> bool:
     """Whether that process ends within `seconds`."""
+    return bool(readable((pidfd,), seconds))
+
+
+def readable(descriptors: Iterable[int], seconds: float | None) -> set[int]:
+    """Those of `descriptors` that are readable or have ended, within `seconds`; None is no limit."""
     poll = select.poll()
-    poll.register(pidfd, select.POLLIN)
-    return bool(poll.poll(seconds * 1e3))
+    for descriptor in descriptors:
+        poll.register(descriptor, select.POLLIN)
+    return {descriptor for descriptor, _ in poll.poll(None if seconds is None else seconds * 1e3)}
 
 
 def reap(pid: int) -> int | None:
