@@ -13,8 +13,9 @@ SOURCES  := pyproject.toml README.md $(shell find aftbed dbc -type f -not -name 
 # commands, searches and drives. Of real runs, each has a core for either replica: two at a time
 # are as many as two cores bear without false alarms. A file stays together, for the runs that its tests share;
 # each page of the docs is a unit of its own. They are taken in the order of collection, the small files last.
-# Only files that have tests of their kind are read.
-FAST := -n auto --dist worksteal -m "not simulation and not process and not deep"
+# Only files that have tests of their kind are read: each worker imports them all.
+FAST := -n auto --dist worksteal -m "not simulation and not process and not deep" \
+  $(sort $(shell grep -rL --include='test_*.py' '^pytestmark = pytest.mark.\(process\|simulation\)$$' tests))
 SIMULATION := -n auto --dist worksteal -m "simulation and not process and not deep" \
   $(sort $(shell grep -rl --include='test_*.py' mark.simulation tests))
 REAL := -n 2 --dist loadgroup --no-loadscope-reorder -m "process and not deep" \

@@ -71,11 +71,12 @@ FIGURES: Final = {  # by the first word of a bench
 }
 
 
-class InstalledVersion(msgspec.Struct, frozen=True):
-    """`version` is what `aftbed --version` prints."""
+class InstalledVersion(msgspec.Struct, frozen=True, omit_defaults=True):
+    """`version` is what `aftbed --version` prints; `options` each bench is given of this version only."""
 
     venv: str
     version: str
+    options: str = ""
 
 
 class VersionChange(msgspec.Struct, frozen=True):
@@ -118,25 +119,35 @@ def bench_compare(
     log: Log,
     *,
     rounds: int = ROUNDS,
+    old_options: str = "",
+    new_options: str = "",
     measure: Measure | None = None,
 ) -> VersionComparison:
-    """Measure `benches` (words behind `aftbed bench`) of both, `rounds` times. Raises ConfigError."""
+    """Measure `benches` (words behind `aftbed bench`) of both, `rounds` times. Raises ConfigError.
+
+    `old_options` and `new_options` are added to each bench of that version: where one knows an option that
+    the other does not, or has another default.
+    """
+    sides = ((old, old_options), (new, new_options))
     for bench in benches:
         check(bench)
-    versions = [InstalledVersion(str(venv), version_of(venv)) for venv in (old, new)]
+        for _, options in sides:
+            check(_with(bench, options))
+    versions = [InstalledVersion(str(venv), version_of(venv), options) for venv, options in sides]
     for bench in benches if measure is None else ():
-        check_options(old, bench)
-        check_options(new, bench)
+        for venv, options in sides:
+            check_options(venv, _with(bench, options))
     changes: list[VersionChange] = []
     left_out: list[str] = []
     machine = {}
 
-    def document(venv: Path, bench: str, number: int) -> Document:
-        log(f"{venv}: aftbed bench {bench}, round {number + 1} of {rounds}")
-        return (measure or measured)(venv, bench)
+    def document(side: tuple[Path, str], bench: str, number: int) -> Document:
+        venv, words = side[0], _with(bench, side[1])
+        log(f"{venv}: aftbed bench {words}, round {number + 1} of {rounds}")
+        return (measure or measured)(venv, words)
 
     for bench in dict.fromkeys(benches):
-        found = in_turn(rounds, partial(document, new, bench), partial(document, old, bench), 0)
+        found = in_turn(rounds, partial(document, sides[1], bench), partial(document, sides[0], bench), 0)
         machine[bench] = found.machine
         for figure in FIGURES[shlex.split(bench)[0]]:
             of_figure = _changes(bench, figure, found.limits, found.figures)
@@ -145,6 +156,10 @@ def bench_compare(
     return VersionComparison(
         versions[0], versions[1], rounds, CONFIDENCE, tuple(changes), tuple(left_out), machine
     )
+
+
+def _with(bench: str, options: str) -> str:
+    return f"{bench} {options}" if options else bench
 
 
 def check(bench: str) -> None:
@@ -290,8 +305,9 @@ def _quantiles(document: Document, path: str) -> dict[str, float]:
 
 def lines(found: VersionComparison) -> Iterator[str]:
     """A line for each version and each change, and what the machine did."""
-    yield f"{'old':14} {found.old.version} ({found.old.venv})"
-    yield f"{'new':14} {found.new.version} ({found.new.venv})"
+    for which, side in (("old", found.old), ("new", found.new)):
+        options = f" with {side.options}" if side.options else ""
+        yield f"{which:14} {side.version} ({side.venv}){options}"
     for one in found.changes:
         interval = f" ({one.interval.low:g} to {one.interval.high:g})" if one.interval else ""
         figure = f"{one.figure} {one.quantile}".strip()

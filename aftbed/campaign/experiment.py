@@ -31,7 +31,7 @@ from aftbed.inject.model import Fault, FaultReport, parse
 from aftbed.judge.asked import WITHOUT_END
 from aftbed.judge.checks import Evidence, Requests
 from aftbed.judge.handling_bound import STALL_NS
-from aftbed.judge.intervals import FTTI, HandlingIntervals, starved
+from aftbed.judge.intervals import FTTI, HandlingIntervals, false_alarm, starved
 from aftbed.judge.outcome import FAILED, OUTCOMES, UNKNOWN, outcome_of, worst
 from aftbed.judge.record import RunEnd, RunRecord, read_record
 from aftbed.judge.simulated import evidence_of_run
@@ -205,6 +205,10 @@ class Probe:
 REASONS_MAX: Final = 3
 REASON_MAX: Final = 300  # characters
 TIMED: Final = ("degraded", "hang")  # classes that a slow machine alone can bring about
+ALONE: Final = (
+    "omission",
+    "unavailable",
+)  # or, if it had a good replica taken for hung, with a fault behind it
 ON_ACTIVATION: Final = {"faults_applied", "adaptations_done", FTTI}  # the result says these in other ways
 UNEXCUSED: Final = (
     "one_master",
@@ -212,6 +216,7 @@ UNEXCUSED: Final = (
     "clean_exit",
     FTTI,
 )  # checks that hold whatever the faults are
+STALL_MS: Final = STALL_NS / 1e6
 RUN_SECONDS_MAX: Final = 60.0
 RECORDS_MAX: Final = 20  # of runs that went wrong, kept of a campaign
 REQUESTS_PER_SECOND_MIN: Final = 100.0  # of a closed loop on a busy machine
@@ -314,10 +319,11 @@ def _real(experiment: Experiment, standing: ExitStack, records: Path | None) -> 
         outcome, reasons = "inconclusive", tuple(verdict.reasons)
     result = _result(experiment, evidence, verdict, outcome, reasons)
     end = evidence.record.end or RunEnd()
+    alarmed = end.starved_ms > STALL_MS and false_alarm(evidence)
     noisy = noisy or starved(end.starved_ms, end.seconds or 0.0) or _excused(result, end.starved_ms)
-    noisy = noisy or _probe().noisy()
+    noisy = noisy or alarmed or _probe().noisy()
     result = msgspec.structs.replace(result, starved_ms=end.starved_ms)
-    result = without_times(result) if noisy else result
+    result = without_times(result, alarmed=alarmed) if noisy else result
     if records is not None and (result.broken or result.unexpected):
         with suppress(OSError):  # of a full disk: the result stands without it
             if not records.is_dir() or sum(1 for _ in records.iterdir()) < RECORDS_MAX:
@@ -327,7 +333,7 @@ def _real(experiment: Experiment, standing: ExitStack, records: Path | None) -> 
 
 def _excused(result: Result, starved_ms: float) -> bool:
     """Whether a fault was handled later than its bound, which is that of a machine with shorter waits."""
-    return result.of_bound is not None and result.of_bound > 1 and starved_ms > STALL_NS / 1e6
+    return result.of_bound is not None and result.of_bound > 1 and starved_ms > STALL_MS
 
 
 def _recorded(experiment: Experiment, standing: ExitStack) -> RunRecord:
@@ -366,12 +372,13 @@ def _probe() -> Probe:
     return Probe()
 
 
-def without_times(result: Result) -> Result:
-    """What is known of a run on a machine that was too busy."""
+def without_times(result: Result, *, alarmed: bool = False) -> Result:
+    """What is known of a run on a busy machine; `alarmed`: it had a good replica taken for hung."""
     reasons = ("the machine was too busy for times to mean anything", *result.reasons)
     timed_stop = result.outcome == "detected_stop" and detects(result.experiment.ftm, "flow")
-    false_alarm = result.unexpected and (result.outcome == "tolerated" or timed_stop)
-    outcome = "inconclusive" if result.outcome in TIMED or false_alarm else result.outcome
+    by_alarm = result.unexpected and (result.outcome == "tolerated" or timed_stop)
+    by_alarm = by_alarm or (alarmed and result.outcome in ALONE)
+    outcome = "inconclusive" if result.outcome in TIMED or by_alarm else result.outcome
     untimed = {"fdti_ms": None, "frti_ms": None, "fhti_ms": None}
     return msgspec.structs.replace(
         result,

@@ -243,6 +243,12 @@ def compare(
         typer.Option("--bench", help="What follows `aftbed bench`, in quotes; may be given several times."),
     ] = None,
     rounds: Annotated[int, typer.Option(min=1, help="Of both in turn; at least 6 for an interval.")] = ROUNDS,
+    old_options: Annotated[
+        str, typer.Option(metavar="TEXT", help="Added to each bench of the old version only, in quotes.")
+    ] = "",
+    new_options: Annotated[
+        str, typer.Option(metavar="TEXT", help="Added to each bench of the new version only, in quotes.")
+    ] = "",
     max_ratio: Annotated[
         float | None, typer.Option(help="Exit code 1 if a ratio new / old is above it with 95 % confidence.")
     ] = None,
@@ -254,7 +260,15 @@ def compare(
     if max_ratio is not None and not 0 < max_ratio < float("inf"):
         raise ConfigError(f"--max-ratio {max_ratio:g}: more than 0 is allowed, 1.05 for 5 % slower")
     given = tuple(benches) if benches else versions.DEFAULT
-    found = versions.bench_compare(old, new, given, _show_progress, rounds=rounds)
+    found = versions.bench_compare(
+        old,
+        new,
+        given,
+        _show_progress,
+        rounds=rounds,
+        old_options=old_options,
+        new_options=new_options,
+    )
     if json:
         print_json(found)
     else:

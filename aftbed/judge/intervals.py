@@ -142,6 +142,17 @@ def starved(starved_ms: float, seconds: float) -> bool:
     return starved_ms > max(STARVED_MS_MIN, STARVED_PART * seconds * 1e3)
 
 
+def false_alarm(evidence: Evidence) -> bool:
+    """Whether a Watchdog suspected a replica before anything had been done to the run."""
+    history = evidence.record.history
+    alarms = (record.t_ns for record in history.events(Event.WATCHDOG_SUSPECT))
+    strikes = (record.t_ns for record in history.events(Event.FAULT_APPLIED))
+    first_ns = min(alarms, default=None)
+    if first_ns is None or evidence.record.adaptations:
+        return False
+    return first_ns < min(strikes, default=first_ns + 1)
+
+
 def intervals(evidence: Evidence) -> list[HandlingIntervals]:
     """Of each fault that struck, in the order of their numbers, then of each adaptation."""
     record = evidence.record

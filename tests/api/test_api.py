@@ -14,6 +14,8 @@ import aftbed
 import aftbed.api
 from aftbed.functions.request_file import read_requests
 
+pytestmark = pytest.mark.simulation
+
 CRASH = "crash primary at server.exit nth 7"
 HERE = Path(__file__).resolve().parent
 

@@ -15,6 +15,8 @@ from aftbed import pytest_plugin
 
 pytest_plugins = ("pytester",)
 
+pytestmark = pytest.mark.simulation
+
 FUNCTION: Final = (Path(__file__).resolve().parent / "counting_function.py").read_text()
 CRASH: Final = "crash primary at server.exit nth"
 

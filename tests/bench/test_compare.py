@@ -66,6 +66,21 @@ def made(tmp_path: Path) -> MakeVenv:
 # -- order
 
 
+def test_options_of_one_side_go_to_that_side_only_even_of_one_venv_twice(made: MakeVenv) -> None:
+    venv = made("one", "")
+    given: list[str] = []
+
+    def measure(_: Path, bench: str) -> compare.Document:
+        given.append(bench)
+        return {"recovery_ms": {"p50": 1.0}}
+
+    found = bench_compare(
+        venv, venv, ("recovery",), lambda _: None, rounds=1, new_options="--rounds 1", measure=measure
+    )
+    assert sorted(given) == ["recovery", "recovery --rounds 1"]
+    assert [line.partition(" with ")[2] for line in list(lines(found))[:2]] == ["", "--rounds 1"]
+
+
 def test_the_versions_alternate_and_each_is_the_first_of_a_pair_in_turn(made: MakeVenv) -> None:
     old, new = made("old", ""), made("new!", "")
     order: list[str] = []

@@ -60,5 +60,16 @@ def test_supervision_may_take_a_busy_machine_for_a_slow_replica(
     assert without_times(found).outcome == after
 
 
+@pytest.mark.parametrize(
+    ("outcome", "after"),
+    [("unavailable", "inconclusive"), ("omission", "inconclusive"), ("sdc", "sdc"), ("masked", "masked")],
+)
+def test_a_fault_that_found_a_replica_given_up_by_a_false_alarm_is_inconclusive(
+    outcome: str, after: str
+) -> None:
+    found = without_times(result(outcome, unexpected=outcome != "masked"), alarmed=True)
+    assert (found.outcome, found.unexpected) == (after, outcome == after == "sdc")
+
+
 def test_a_probe_is_calibrated_by_the_machine_it_runs_on() -> None:
     assert Probe().quiet_ms < 1000

@@ -10,7 +10,15 @@ from aftbed.core.events import FIRST_FAULT, RERUN, Event
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import BusTimes, ReceiptState
 from aftbed.judge.checks import Check, Evidence
-from aftbed.judge.intervals import BY_MECHANISM, HandlingIntervals, Occasion, Reaction, check_ftti, intervals
+from aftbed.judge.intervals import (
+    BY_MECHANISM,
+    HandlingIntervals,
+    Occasion,
+    Reaction,
+    check_ftti,
+    false_alarm,
+    intervals,
+)
 from aftbed.judge.record import RunEnd, RunRecord
 from aftbed.judge.reference import reference_run
 from aftbed.runtime.adaptations import Outcome
@@ -78,6 +86,15 @@ def test_a_fault_begins_when_the_supervisor_strikes_and_not_when_a_node_came_to_
     tale.note("a/watchdog.1", Event.WATCHDOG_SUSPECT).fenced(1).promoted(2)
     tale.accepted(2, epoch=2, replica=2).answered(2, epoch=2)
     assert times(only(tale, CRASH)) == (1.0, 4.0, 5.0, "operational")
+
+
+def test_a_suspicion_before_anything_struck_is_a_false_alarm() -> None:
+    calm = Tale().served(1)
+    assert not false_alarm(evidence(calm))
+    alarmed = calm.note("b/watchdog.1", Event.WATCHDOG_SUSPECT)
+    assert false_alarm(evidence(alarmed))
+    assert false_alarm(evidence(struck(alarmed), CRASH))
+    assert not false_alarm(evidence(a_crash(), CRASH))
 
 
 def test_the_supervisor_detects_the_death_of_a_node_of_no_replica() -> None:

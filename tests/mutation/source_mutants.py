@@ -310,6 +310,15 @@ MUTANTS: Final = (
         "    linux.continue_at_parents_death()\n",
         "",
         PROCESS,
+        ("tests/process/test_head_start.py::test_a_supervisor_that_was_stopped_ends_with_its_command",),
+    ),
+    SourceMutant(
+        "a stopped supervisor that was forked at the launch is not continued when its command dies",
+        "G7",
+        f"{UNIX}/launch.py",
+        "        linux.continue_at_parents_death()\n        os.setsid()\n        if listener",
+        "        os.setsid()\n        if listener",
+        PROCESS,
         (KILLS + "test_a_killed_command_leaves_nothing_whatever_its_keepers_suffer",),
     ),
     SourceMutant(

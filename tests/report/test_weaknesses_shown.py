@@ -14,6 +14,8 @@ from aftbed.report.html import html_report
 from aftbed.report.markdown import markdown_summary
 from aftbed.report.terminal import PLACES_MAX, places, summary_lines
 
+pytestmark = pytest.mark.simulation
+
 
 @pytest.fixture(scope="module")
 def weak(tmp_path_factory: pytest.TempPathFactory) -> tuple[Ledger, Summary]:
