@@ -308,11 +308,12 @@ class Report(msgspec.Struct, frozen=True, tag=True):
     data: bytes
 
 
-# Kinds of reports to the command, besides the last ones (`finished`, `trouble`).
+# Kinds of reports to the command, besides `trouble`.
 TELEMETRY: Final = "telemetry"  # a Telemetry of the vehicle
 SIGHT: Final = "sight"  # a Sight of a replay
 STATE: Final = "state"  # a ServiceState, when it is another one
 EVENT: Final = "event"  # a line of the log, as JSON
+FINISHED: Final = "finished"  # the last one: how it ended, as JSON
 
 
 class RequestCounts(msgspec.Struct, frozen=True):

@@ -8,11 +8,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from liveruns import SHORT, SHOWN_BYTES, Command, Home, aftbed, until
+from liveruns import SHORT, SHOWN_BYTES, Command, Home, Started, aftbed, ended, until
 from terminal import Terminal
 
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix import control_client, run_directory
+from aftbed.runtime.unix.options import CarRun
 
 pytestmark = pytest.mark.process
 
@@ -238,6 +239,16 @@ def test_a_run_is_steered_by_keys(home: Home) -> None:
         assert terminal.code() == 0, terminal.raw[-SHOWN_BYTES:]
         assert b"verdict: pass" in terminal.raw
         assert terminal.modes == before
+
+
+def test_a_run_can_end_while_its_command_is_suspended(home: Home, tmp_path: Path) -> None:
+    """More is reported than fits, and nothing reads it; how it ended comes through."""
+    drive = CarRun("free-drive", None, "latch", duration_ms=30_000)
+    with Started(home, drive, placement="replica", record=tmp_path / "record") as run:
+        assert ended(run.launched.supervisor)
+        done = run.finish()
+    assert run.launched.end is not None
+    assert done.verdict.verdict == "pass", done.verdict.reasons
 
 
 def test_a_run_without_a_terminal_prints_lines(home: Home) -> None:

@@ -6,6 +6,7 @@ supervisor the parent of whatever its descendants leave behind.
 
 import contextlib
 import ctypes
+import fcntl
 import os
 import resource
 import select
@@ -14,6 +15,7 @@ import site
 import socket
 import struct
 import sys
+import termios
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
@@ -259,6 +261,12 @@ def reap(pid: int) -> int | None:
         if got == pid:
             return os.waitstatus_to_exitcode(status)
     return None
+
+
+def backlog(sock: socket.socket) -> float:
+    """How much of what fits is sent and not read yet: 0 to 1 (SIOCOUTQ, unix(7))."""
+    waiting = int.from_bytes(fcntl.ioctl(sock, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
+    return waiting / sock.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
 
 
 def set_timeouts(sock: socket.socket, receive_seconds: float, send_seconds: float) -> None:

@@ -43,6 +43,9 @@ from aftbed.vehicle.condition import Condition
 
 LOOK_SECONDS: Final = 0.05  # between two looks at all nodes
 LOG_SECONDS: Final = 0.005  # until a line is written: a failover does not wait for that
+# How much may be unread for a report to be sent: of what fits.
+PICTURES_BACKLOG_MAX: Final = 0.5
+BACKLOG_MAX: Final = {control.EVENT: 0.75, control.FINISHED: 1.0}
 COUNTS_SECONDS: Final = 0.2  # between two reports that differ in counts alone, at least
 LATE_NS_MAX: Final = 40_000_000  # of a look: beyond it the machine was too busy to judge what hangs
 DRAIN_SECONDS_MAX: Final = 2.0
@@ -261,9 +264,13 @@ class Supervisor:
             self._finish("interrupted")
 
     def _report_owner(self, kind: str, data: bytes) -> None:
-        """To the command; dropped if it does not read, since a view must not stop a run."""
+        """To the command; dropped if it does not read (Ctrl-Z), since a view must not stop a run.
+
+        Pictures are dropped first, then events, so that there is room for how the run has ended.
+        """
         try:
-            self._owner.send(control.Report(kind, data))
+            if linux.backlog(self._owner.sock) <= BACKLOG_MAX.get(kind, PICTURES_BACKLOG_MAX):
+                self._owner.send(control.Report(kind, data))
         except OSError:
             return
 
@@ -363,7 +370,7 @@ class Supervisor:
         new = self._record / "end.json.new"
         new.write_text(json.dumps(end))
         new.rename(self._record / "end.json")  # complete, or not there
-        self._report_owner("finished", json.dumps(end).encode())
+        self._report_owner(control.FINISHED, json.dumps(end).encode())
 
     def _let_end(self, hub: UnixProcess) -> None:
         """Give the hub time to tell its clients that the run has ended."""
