@@ -37,7 +37,7 @@ from aftbed.core.errors import shown
 from aftbed.report.steering import ANSWER_CHARACTERS_MAX, COMMAND_S_MAX, child_command
 from aftbed.runtime.control import ServiceState
 from aftbed.runtime.unix import linux
-from aftbed.runtime.unix.options import RunOptions
+from aftbed.runtime.unix.options import LoadRun, RunOptions
 from aftbed.vehicle.aeb.messages import STAGE_NONE, Sight
 from aftbed.vehicle.plant import Telemetry
 
@@ -84,7 +84,8 @@ class RunPicture(msgspec.Struct):
     """A run as it is now. Of a drive there is `telemetry`, of a replay `sight`."""
 
     title: str
-    bus: str
+    bus: str = ""
+    load: int = 0  # requests of a load, which has neither
     state: ServiceState | None = None
     telemetry: Telemetry | None = None
     sight: Sight | None = None
@@ -141,7 +142,12 @@ def _car(picture: RunPicture) -> Line:
             f"{seen.t_ms / 1e3:7.2f} s {speed}  {gap}{_ttc(seen.ttc_s)}"
             f"  asks for {seen.deceleration_ms2:.1f} m/s2{more}"
         )
-    return (StyledText("waiting for the first request" if picture.state else "starting", Style.FAINT),)
+    if picture.state is None:
+        return (StyledText("starting", Style.FAINT),)
+    if not picture.load:
+        return (StyledText("waiting for the first request", Style.FAINT),)
+    answered = picture.state.requests.answered if picture.state.requests is not None else 0
+    return (StyledText(f"{answered} of {picture.load} requests answered"),)
 
 
 def collides(car: Telemetry) -> bool:
@@ -323,7 +329,8 @@ class LiveView(RunView):
         self._bars = screen.can_show(BARS)
         self._picture = RunPicture(
             f"aftbed run {options.run}  {options.placement}  seed {options.seed}",
-            bus_line(options) if options.port else "",
+            bus=bus_line(options) if options.port else "",
+            load=options.work.count if isinstance(options.work, LoadRun) else 0,
         )
         self._frozen: RunPicture | None = None
         self._events: deque[LogLine] = deque(maxlen=EVENTS_KEPT)

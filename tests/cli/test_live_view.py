@@ -98,7 +98,7 @@ def texts(lines: list[tuple[StyledText, ...]]) -> list[str]:
 @pytest.mark.parametrize(("columns", "rows"), [(40, 10), (80, 24), (200, 60), (1, 1)])
 def test_a_picture_has_the_size_of_its_screen(columns: int, rows: int) -> None:
     events = tuple(LogLine(i * 10.0, "script.done", f"failover {i}") for i in range(500))
-    picture = RunPicture(TITLE, "bus: can0", STATE, CAR, samples=((50.0, 34.2, 0.0),) * 300, events=events)
+    picture = RunPicture(TITLE, "bus: can0", 0, STATE, CAR, samples=((50.0, 34.2, 0.0),) * 300, events=events)
     lines = lines_of(picture, columns, rows)
     assert len(lines) == rows
     assert {sum(len(text) for text, _ in fitted(line, columns)) for line in lines} == {columns}
@@ -121,12 +121,17 @@ def test_the_mechanism_is_the_one_that_runs_now() -> None:
 def test_a_replay_shows_what_the_function_sees() -> None:
     targets = (AebTarget(0, 34.0, -10.0), AebTarget(1, 60.0, -30.0))
     seen = sight_of(AebInput(1500, 20.0, True, True, targets), FULL, 6.0)
-    lines = texts(lines_of(RunPicture(TITLE, "", STATE, sight=seen), 100, 24))
+    lines = texts(lines_of(RunPicture(TITLE, state=STATE, sight=seen), 100, 24))
     words = " ".join(lines[1].split())
     assert words == "FULL 1.50 s 72.0 km/h gap 34.00 m TTC 2.0 s asks for 6.0 m/s2 2 targets"
     blind = sight_of(AebInput(1500, 0.0, False, False, ()), 0, 0.0)
-    lines = texts(lines_of(RunPicture(TITLE, "", STATE, sight=blind), 100, 24))
+    lines = texts(lines_of(RunPicture(TITLE, state=STATE, sight=blind), 100, 24))
     assert "speed unknown  radar unknown" in lines[1]
+
+
+def test_a_load_shows_how_far_it_is() -> None:
+    lines = texts(lines_of(RunPicture(TITLE, load=500, state=STATE), 80, 10))
+    assert lines[1] == "40 of 500 requests answered"
 
 
 def test_what_others_wrote_cannot_move_the_cursor() -> None:
@@ -251,6 +256,22 @@ def test_a_terminal_that_does_not_read_does_not_stop_the_run() -> None:
             run.report(cast(Telemetry, changed(CAR, t_ms=t_ms)))
         run.terminal.type("p\x11")  # Ctrl-Q
         run.terminal.until_shown("299.95 s")
+
+
+def test_a_run_ends_though_its_terminal_does_not_read() -> None:
+    """What gives the terminal back comes before the verdict, when it reads again."""
+    with FakeRun() as run:
+        before = run.terminal.modes
+        run.report(STATE)
+        run.terminal.until_shown("a leads")
+        run.terminal.type("\x13")
+        run.report(cast(ServiceState, changed(STATE, epoch=2)))
+        run.end()
+        run.terminal.until(lambda: run.terminal.modes == before, "the modes of before")
+        run.terminal.type("\x11")
+        assert run.terminal.code() == 0
+        assert given_back(run.terminal, before)
+        assert run.terminal.raw.rstrip().endswith(b"the verdict")
 
 
 # -- keys -----------------------------------------------------------------------------------------
