@@ -16,7 +16,7 @@ from terminal import Terminal
 
 from aftbed.cli import live_view
 from aftbed.cli.colour import Style
-from aftbed.cli.live_view import LogLine, Prompt, RunPicture, lines_of
+from aftbed.cli.live_view import LiveView, LogLine, Prompt, RunPicture, lines_of
 from aftbed.cli.run import _follow, _open_view
 from aftbed.cli.screen import Key, Screen, StyledText, fitted, keys_in
 from aftbed.runtime import control
@@ -394,3 +394,18 @@ def test_keys_are_not_read_where_standard_input_is_no_terminal() -> None:
         assert terminal.code() == 0
         assert b"[] b'q'" in terminal.raw
         assert terminal.modes == before
+
+
+def test_y_and_n_answer_what_a_policy_asks() -> None:
+    keys: list[list[Key | str]] = [["y", "n"]]
+    screen = SimpleNamespace(
+        has_keys=True,
+        attend=keys.pop,
+        can_show=lambda text: True,
+        size=(80, 24),
+        draw=lambda lines: True,
+    )
+    view, decided = LiveView(OPTIONS, cast(Screen, screen)), list[str]()
+    view.decide = decided.append
+    view.attend()
+    assert decided == ["y", "n"]
