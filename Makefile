@@ -7,6 +7,7 @@ VENV   ?= .venv
 BIN      := $(VENV)/bin
 PLAIN    := $(VENV)/.installed-plain
 EDITABLE := $(VENV)/.installed-editable
+DOCS     := $(VENV)/.installed-docs
 SOURCES  := pyproject.toml README.md $(shell find aftbed dbc -type f -not -name '*.pyc')
 
 # The tests without real runs take every core: those of one thing each, which are run while one edits, then whole
@@ -26,7 +27,7 @@ FAULT := crash primary at checkpoint.sent nth 100
 # Hundreds of interpreters start in the tests; without bytecode each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test lint fast simulation process deep mutants bench soak
+.PHONY: help demo test lint fast simulation process deep mutants bench soak docs pictures
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
 
@@ -38,6 +39,8 @@ help:
 	@echo "make simulation  the tests that simulate many runs or drives: whole commands, searches, planted bugs"
 	@echo "make process     the tests that start real runs: a sample of their combinations"
 	@echo "make deep        the exhaustive tests, and thousands of examples of every property: hours"
+	@echo "make docs        the pages of docs/ as a site: build/docs/index.html"
+	@echo "make pictures    the pictures of the README, of runs that it makes (ONLY=page: that one; with Chromium and tmux)"
 	@echo "make mutants     plant bugs one by one, see what notices them, write docs/assumptions.md (ONLY=words: some, print)"
 	@echo "make soak        one run of 30 minutes with a crash every 2 s, an adaptation every 5 s: does anything grow?"
 	@echo "make bench       every figure of docs/numbers.md, written into its table: ten minutes (OLD=VENV: then compare with it)"
@@ -76,6 +79,13 @@ bench: $(EDITABLE)
 soak: $(EDITABLE)
 	$(BIN)/aftbed bench soak --minutes 30 --rate 500 --crash-every 2 --adapt-every 5
 
+docs: $(DOCS)
+	$(BIN)/python -m sphinx -W --keep-going -E -q -b html -d build/doctrees -c docs . build/docs
+	@echo "build/docs/index.html"
+
+pictures: $(EDITABLE)
+	$(BIN)/python tests/docs/make_pictures.py $(ONLY)
+
 # -- installation: a stamp each, so that a second `make` installs only what has changed ------------
 
 $(BIN)/python:
@@ -89,5 +99,10 @@ $(PLAIN): $(SOURCES) | $(BIN)/python
 
 $(EDITABLE): pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[test]"
+	@rm -f $(PLAIN)
+	@touch $@
+
+$(DOCS): pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[docs]"
 	@rm -f $(PLAIN)
 	@touch $@

@@ -63,6 +63,7 @@ IMPURE_PLACES: Final = (  # where clock, socket, process, file and chance may li
     "aftbed.pytest_plugin",
     "aftbed.core.archive",
     "aftbed.core.input_file",  # the readers of files in core: all upper rows read by them
+    "aftbed.core.installed",  # metadata of packages
     "aftbed.core.yaml_file",
 )
 SEEDED_PLACES: Final = ("aftbed.runtime.sim",)  # chance, but from a seed: nothing of `random` but its class

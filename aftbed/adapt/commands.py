@@ -29,7 +29,7 @@ from aftbed.core.graph import Graph
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import RECIPES, after
 from aftbed.core.units import milliseconds
-from aftbed.ftm.compose import DUPLEX, SIMPLEX, canonical, parse
+from aftbed.ftm.compose import canonical, parse, replicates
 from aftbed.ftm.registry import KINDS
 
 VERBS: Final = ("to", "switch", "compose", "decompose", "update")
@@ -120,7 +120,7 @@ def _check_verb(wish: Wish, running: str, old: tuple[str, ...], new: tuple[str, 
         raise ConfigError(f"{new[0]} is the outer mechanism already ({running} runs): {command}")
     if new[0] == old[0]:
         raise ConfigError(f"{wish.name} is not all of {running}, and more inside: {command}")
-    if old[0] in DUPLEX and set(new) <= set(SIMPLEX) and not set(new) & set(old):
+    if replicates(old[0]) and not any(map(replicates, new)) and not set(new) & set(old):
         instead = f"compose {running}+{wish.name}, or to {wish.name}"
     else:
         instead = f"to {wish.name}" + (f", or switch {new[0]} first" if len(new) > 1 else "")

@@ -45,8 +45,8 @@ from msgspec import Meta
 
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.events import Event
-from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, NONE, SIMPLEX, parse
-from aftbed.ftm.registry import MECHANISMS
+from aftbed.ftm.compose import DUPLEX, SIMPLEX, known_expressions, parse, replicates
+from aftbed.ftm.registry import MECHANISMS, find
 
 # What is observed of a run; `symptoms` has the events.
 Symptom = Literal["crash", "hang", "value_fault", "divergence", "detected_stop"]
@@ -63,36 +63,35 @@ VOTE_MASKED: Final = 3  # detail of `vote.compared`: it took a third trial, so o
 SETTLE_ROUNDS: Final = 3
 SHADOWED: Final = "the first holds already where the second begins; the narrower condition must stand first"
 TOO_NEAR: Final = "both can hold at once, or next to each other; there must be a gap between them"
-ADAPTABLE: Final = tuple(e for e in EXPRESSIONS if e != NONE)  # nothing leads to `none`, or away from it
 
 
 class When(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A condition, key by key; which keys go together is checked by `policy_from`."""
 
-    event: Symptom | None = None
-    count: Annotated[int, Meta(ge=1, le=COUNT_MAX)] | None = None
-    within_s: Seconds | None = None
-    quiet_s: Seconds | None = None
-    resource: Resource | None = None
-    above: Value | None = None
-    below: Value | None = None
-    until: Value | None = None
-    for_s: Annotated[float, Meta(ge=0, le=86_400)] | None = None
+    event: Symptom | None = None  # a symptom; with count and within_s, or with quiet_s
+    count: Annotated[int, Meta(ge=1, le=COUNT_MAX)] | None = None  # so many of the event
+    within_s: Seconds | None = None  # in so long
+    quiet_s: Seconds | None = None  # none of the event for so long
+    resource: Resource | None = None  # with above or below
+    above: Value | None = None  # it begins at more than this
+    below: Value | None = None  # it begins at less than this
+    until: Value | None = None  # it ends here; none: where it began
+    for_s: Annotated[float, Meta(ge=0, le=86_400)] | None = None  # so long without a break
 
 
 class RuleFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One rule of a file."""
 
-    when: When
-    then: str
+    when: When  # the condition
+    then: str  # to FTM, switch FTM, compose FTM, or decompose
 
 
 class PolicyFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A policy, key by key."""
 
-    dwell_s: Seconds
-    rules: tuple[RuleFile, ...]
-    description: str = ""
+    dwell_s: Seconds  # after an adaptation there is no other one for so long
+    rules: tuple[RuleFile, ...]  # the first one that holds decides
+    description: str = ""  # for people
 
 
 class Burst(msgspec.Struct, frozen=True):
@@ -166,7 +165,7 @@ class Action(msgspec.Struct, frozen=True):
             case "to":
                 return self.name
             case "switch":
-                return "+".join((self.name, *(n for n in names if n not in DUPLEX)))
+                return "+".join((self.name, *(n for n in names if not replicates(n))))
             case "compose":
                 inside = names if self.name in names else (*names, self.name)
                 return "+".join(sorted(inside, key=lambda n: MECHANISMS[n].innermost))
@@ -224,7 +223,7 @@ def action(text: str, where: str) -> Action:
             raise ConfigError(f"{where}: found {text!r}, allowed is `decompose`: all that is inside goes")
     else:
         allowed = DUPLEX if verb == "switch" else SIMPLEX
-        if found.name not in allowed:
+        if find(found.name) is None or replicates(found.name) != (verb == "switch"):
             raise ConfigError(f"{where}: {unknown(f'FTM to {verb}', found.name, allowed)}")
     return found
 
@@ -253,7 +252,7 @@ def contradiction(first: Rule, second: Rule) -> str:
 def conflict(one: Action, other: Action) -> bool:
     """Whether the two, each carried out whenever it would change something, never come to rest."""
     for first, second in ((one, other), (other, one)):
-        for running in ADAPTABLE:
+        for running in known_expressions()[1:]:  # nothing leads to `none`, or away from it
             for _ in range(SETTLE_ROUNDS):
                 running = second.applied(first.applied(running))  # noqa: PLW2901 - towards a fixed point
             if not first.applied(running) == second.applied(running) == running:

@@ -53,10 +53,11 @@ from aftbed.core.application import EXACT, NONE, Characteristics, StateAccess, a
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.script import Align, Transfer
-from aftbed.ftm.compose import EXPRESSIONS, build, parse
 from aftbed.ftm.compose import NONE as NO_MECHANISM
+from aftbed.ftm.compose import build, known_expressions, parse
 from aftbed.ftm.declaration import FaultClass
-from aftbed.ftm.registry import MECHANISMS
+from aftbed.ftm.registry import MECHANISMS, SHIPPED, find
+from aftbed.ftm.registry import names as known_names
 
 NOTHING_ASKED: Final = FaultModel(crash=False)
 ACCESSES: Final[dict[str, StateAccess]] = {"exact": EXACT, "approximate": approximate(1e-3), "no": NONE}
@@ -205,7 +206,7 @@ class Resilience(msgspec.Struct, frozen=True):
 def mechanisms_of(text: str) -> tuple[str, ...]:
     """`pbr,lfr,tr` in the order of the registry. Raises ConfigError."""
     names = [name.strip() for name in text.split(",") if name.strip()]
-    known = ", ".join(MECHANISMS)
+    known = ", ".join(SHIPPED)
     if not names:
         raise ConfigError(f"a set without a mechanism answers nothing; {known} are allowed, with commas")
     for name in names:
@@ -216,19 +217,19 @@ def mechanisms_of(text: str) -> tuple[str, ...]:
                 f"{name} is a composition: a set has what its mechanisms compose;"
                 f" {','.join(name.split('+'))} is allowed"
             )
-        if name not in MECHANISMS:
-            raise unknown("mechanism", name, MECHANISMS)
-    return tuple(name for name in MECHANISMS if name in names)
+        if find(name) is None:
+            raise unknown("mechanism", name, known_names())
+    return tuple(name for name in known_names() if name in names)
 
 
 def expressions_of(mechanisms: Sequence[str]) -> tuple[str, ...]:
     """All that can run of a set: each mechanism, and each composition."""
-    return tuple(e for e in EXPRESSIONS if e != NO_MECHANISM and set(parse(e)) <= set(mechanisms))
+    return tuple(e for e in known_expressions() if e != NO_MECHANISM and set(parse(e)) <= set(mechanisms))
 
 
 def axes(table: SuitabilityTable = TABLE) -> tuple[Axis, ...]:
     """All that can change, with the values that `table` tells apart."""
-    limits, counts = table.limits, sorted({1, *(row.cpus for row in table.rows.values())}, reverse=True)
+    limits, counts = table.limits, sorted({1, *(table.row(name).cpus for name in MECHANISMS)}, reverse=True)
     return (
         *(Axis(AssumptionKind.FT, name, _faults(name)) for name in FAULTS if name not in PART_OF),
         Axis(
@@ -322,9 +323,9 @@ def candidates(mechanisms: Sequence[str], table: SuitabilityTable = TABLE) -> It
     """What may be added to a set, one mechanism each."""
     for name in MECHANISMS:
         if name not in mechanisms:
-            yield Candidate(name, Addition.AS_SHIPPED, table.rows[name])
+            yield Candidate(name, Addition.AS_SHIPPED, table.row(name))
     for name in MECHANISMS:
-        yield from _with_less(table.rows[name])
+        yield from _with_less(table.row(name))
 
 
 def _with_less(row: Row) -> Iterator[Candidate]:

@@ -52,7 +52,7 @@ from aftbed.core.script import (
     flat,
     names,
 )
-from aftbed.ftm.compose import EXPRESSIONS, NONE, REPLICAS, STATEFUL, build, replication_of
+from aftbed.ftm.compose import NONE, REPLICAS, STATEFUL, build, known_expressions, replication_of
 from aftbed.ftm.registry import KINDS
 
 REQUEST_PORTS: Final = ("pxy2pro", "pro2bfr", "bfr2prd", "prd2srv")  # the way of a request, as outputs
@@ -238,7 +238,7 @@ def _led_to(graph: Graph, script: Script) -> list[str]:
     found += [
         f"{k.source}.{k.source_port} does not carry what {k.sink}.{k.sink_port} takes"
         for k in new.links
-        if (k.source_port, k.sink_port) not in _linked_ports()
+        if (k.source_port, k.sink_port) not in _linked_ports(known_expressions())
     ]
     found += _loops(new)
     if NONE in (graph.ftm, script.ftm):
@@ -247,9 +247,9 @@ def _led_to(graph: Graph, script: Script) -> list[str]:
 
 
 @cache
-def _linked_ports() -> frozenset[tuple[str, str]]:
+def _linked_ports(expressions: tuple[str, ...]) -> frozenset[tuple[str, str]]:
     """Pairs of ports that some mechanism links."""
-    graphs = [build(e, PLACEMENTS[0]) for e in EXPRESSIONS if e != NONE]
+    graphs = [build(e, PLACEMENTS[0]) for e in expressions if e != NONE]
     return frozenset((k.source_port, k.sink_port) for g in graphs for k in g.links)
 
 

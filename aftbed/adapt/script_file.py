@@ -46,24 +46,59 @@ from aftbed.ftm.compose import parse
 from aftbed.ftm.registry import KINDS
 
 ARROW: Final = "->"
-PORTS: Final = tuple(dict.fromkeys(p for kind in KINDS.values() for p in (*kind.inputs, *kind.outputs)))
 RECOVERY: Final = ("spawn", "fence", "kill", "promote", "attach")
 VERBS: Final[dict[str, type[Step]]] = {
     step.__name__.lower(): step for step in get_args(Step) if step.__name__.lower() not in RECOVERY
 }
 
 StepEntry = dict[str, object]  # one verb, and what it acts on
+_TEXT: Final = {"type": "string"}
+_OBJECTS: Final[dict[type[Step], dict[str, object]]] = {  # as JSON Schema; of all other verbs it is a text
+    Stage: {
+        "type": "object",
+        "properties": {
+            "node": _TEXT,
+            "bricks": {
+                "type": "object",
+                "minProperties": 1,
+                "additionalProperties": {
+                    "anyOf": [
+                        _TEXT,
+                        {
+                            "type": "object",
+                            "properties": {"kind": _TEXT, "source": _TEXT, "application": _TEXT},
+                            "required": ["kind"],
+                            "additionalProperties": False,
+                        },
+                    ]
+                },
+            },
+            "held": {"type": "boolean"},
+        },
+        "required": ["node", "bricks"],
+        "additionalProperties": False,
+    },
+    Together: {"type": "array", "minItems": 1, "items": {"$ref": "#/definitions/Step"}},
+}
+STEP_SCHEMA: Final[dict[str, object]] = {
+    "description": "One verb with what it acts on.",
+    "type": "object",
+    "properties": {verb: _OBJECTS.get(step, _TEXT) for verb, step in VERBS.items()},
+    "minProperties": 1,
+    "maxProperties": 1,
+    "additionalProperties": False,
+}
 
 
 class ScriptFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A script, key by key; what a step may be is checked by `script_from`."""
 
-    purpose: Annotated[str, Meta(min_length=1, max_length=200)]
-    commit: tuple[object, ...]
-    prepare: tuple[object, ...] = ()
-    finish: tuple[object, ...] = ()
-    ftm: str = ""
-    recipe: Literal["drained", "paper"] = "drained"
+    purpose: Annotated[str, Meta(min_length=1, max_length=200)]  # in a line, for people
+    commit: tuple[object, ...]  # steps while requests wait
+    prepare: tuple[object, ...] = ()  # steps beside what serves
+    finish: tuple[object, ...] = ()  # steps once requests are served again
+    ftm: str = ""  # the mechanism that it leads to; none: that which runs
+    recipe: Literal["drained", "paper"] = "drained"  # paper: SIGSTOP, kill, launch, link, SIGCONT
 
 
 # -- from a script to a file ----------------------------------------------------------------------
@@ -211,6 +246,11 @@ def _brick_spec(name: str, value: object, where: str) -> BrickSpec:
     return BrickSpec(name, **texts)
 
 
+def port_names() -> tuple[str, ...]:
+    """Of all kinds of bricks that are known here: the mechanism of the script is."""
+    return tuple(dict.fromkeys(p for kind in KINDS.values() for p in (*kind.inputs, *kind.outputs)))
+
+
 def _keys(value: object, where: str, allowed: tuple[str, ...], needed: tuple[str, ...]) -> StepEntry:
     if not isinstance(value, dict):
         raise ConfigError(f"{where}: found {value!r}, allowed are the keys {', '.join(allowed)}")
@@ -242,8 +282,8 @@ def _end(text: str, where: str) -> tuple[str, str]:
     parts = text.split(".")
     for at in range(1, len(parts)):
         brick, port = ".".join(parts[:at]), ".".join(parts[at:])
-        if brick and port in PORTS:
+        if brick and port in port_names():
             return brick, port
     if len(parts) == 1:
         raise ConfigError(f"{where}: found {text!r}, allowed is BRICK.PORT")
-    raise ConfigError(f"{where}: {unknown('port', parts[-1], PORTS)}")
+    raise ConfigError(f"{where}: {unknown('port', parts[-1], port_names())}")

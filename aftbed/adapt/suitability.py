@@ -31,9 +31,9 @@ from msgspec import Meta
 
 from aftbed.core.application import NONE, AccessKind, Characteristics
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, parse
-from aftbed.ftm.declaration import FaultClass, Level, Suitability
-from aftbed.ftm.registry import MECHANISMS
+from aftbed.ftm.compose import expressions, parse, replicates
+from aftbed.ftm.declaration import FaultClass, Level, Mechanism, Suitability
+from aftbed.ftm.registry import MECHANISMS, SHIPPED, find, names
 
 Part = Annotated[float, Meta(ge=0, le=1)]
 Rate = Annotated[float, Meta(ge=0, le=1e9)]
@@ -78,7 +78,7 @@ AMPLE: Final = Resources(cpus=1024)  # where R is not at stake
 class Row(Suitability, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What one mechanism tolerates and needs."""
 
-    mechanism: str
+    mechanism: str  # whose row it is
 
 
 class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -88,10 +88,10 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bandwidths carry 50 requests a second of the brake function: as requests (low), as states (high).
     """
 
-    low_cpu_load_max: Part = 0.9
-    high_cpu_load_max: Part = 0.5
-    low_bandwidth_kbit_s_min: Rate = 64.0
-    high_bandwidth_kbit_s_min: Rate = 256.0
+    low_cpu_load_max: Part = 0.9  # of a mechanism of low CPU load
+    high_cpu_load_max: Part = 0.5  # of one of high CPU load
+    low_bandwidth_kbit_s_min: Rate = 64.0  # of a mechanism of low bandwidth
+    high_bandwidth_kbit_s_min: Rate = 256.0  # of one of high bandwidth
 
 
 class SuitabilityTable(msgspec.Struct, frozen=True):
@@ -100,12 +100,16 @@ class SuitabilityTable(msgspec.Struct, frozen=True):
     rows: dict[str, Row]
     limits: Limits = Limits()
 
+    def row(self, name: str) -> Row:
+        """That of a mechanism that is known. An installed one has the row that it declares, if no other."""
+        return self.rows.get(name) or _declared(MECHANISMS[name])
+
 
 class TableFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A user's file: each row takes the place of the shipped one for the same mechanism."""
 
-    rows: tuple[Row, ...] = ()
-    limits: Limits = Limits()
+    rows: tuple[Row, ...] = ()  # each takes the place of that of the same mechanism
+    limits: Limits = Limits()  # what the classes mean in numbers
 
 
 class Demand(msgspec.Struct, frozen=True):
@@ -125,17 +129,19 @@ class Demand(msgspec.Struct, frozen=True):
     bandwidth: Level
 
 
-ROWS: Final = tuple(
-    Row(mechanism=one.name, **msgspec.structs.asdict(one.suitability)) for one in MECHANISMS.values()
-)
+def _declared(one: Mechanism) -> Row:
+    return Row(mechanism=one.name, **msgspec.structs.asdict(one.suitability))
+
+
+ROWS: Final = tuple(_declared(MECHANISMS[name]) for name in SHIPPED)
 TABLE: Final = SuitabilityTable({row.mechanism: row for row in ROWS})
 
 
 def table_from(file: TableFile, where: str) -> SuitabilityTable:
     """The shipped table with the rows of `file` in it; `where` names the file. Raises ConfigError."""
     for index, row in enumerate(file.rows):
-        if row.mechanism not in MECHANISMS:
-            reason = unknown("FTM", row.mechanism, MECHANISMS)
+        if find(row.mechanism) is None:
+            reason = unknown("FTM", row.mechanism, names())
             raise ConfigError(f"{where}: rows[{index}].mechanism: {reason}")
     for name, times in Counter(row.mechanism for row in file.rows).items():
         if times > 1:
@@ -154,13 +160,13 @@ def fault_model(text: str) -> FaultModel:
 
 def demand(expression: str, table: SuitabilityTable = TABLE) -> Demand:
     """What `expression` tolerates and needs. Raises ConfigError if it is none."""
-    names = parse(expression)
-    rows = [table.rows[name] for name in names]
+    parts = parse(expression)
+    rows = [table.row(name) for name in parts]
     detects = _united(row.detects for row in rows)
     tolerates = _united(row.tolerates for row in rows)
     return Demand(
         expression,
-        tolerates=_united((tolerates, detects)) if _replicates(names) else tolerates,
+        tolerates=_united((tolerates, detects)) if _replicates(parts) else tolerates,
         detects=detects,
         deterministic=tuple(
             f"{row.mechanism} needs a deterministic function: {row.deterministic}"
@@ -216,13 +222,13 @@ def consistent(
     table: SuitabilityTable = TABLE,
 ) -> list[str]:
     """The consistent expressions, the cheapest first; [] is "no consistent FTM"."""
-    found = [e for e in EXPRESSIONS if not problems(e, faults, characteristics, resources, table)]
+    found = [e for e in expressions() if not problems(e, faults, characteristics, resources, table)]
     return sorted(found, key=lambda expression: cost(expression, table))
 
 
 def cost(expression: str, table: SuitabilityTable = TABLE) -> tuple[int, int, int]:
     """To sort by: CPUs, CPU load, bandwidth; the last two summed over the parts."""
-    rows = [table.rows[name] for name in parse(expression)]
+    rows = [table.row(name) for name in parse(expression)]
     cpu_load = sum(LEVELS.index(row.cpu_load) for row in rows)
     return demand(expression, table).cpus, cpu_load, sum(LEVELS.index(row.bandwidth) for row in rows)
 
@@ -275,7 +281,7 @@ def _united(faults: Iterable[tuple[FaultClass, ...]]) -> tuple[FaultClass, ...]:
 
 
 def _replicates(names: tuple[str, ...]) -> bool:
-    return bool(names) and names[0] in DUPLEX
+    return bool(names) and replicates(names[0])
 
 
 def _short_of(wanted: Demand, resources: Resources, limits: Limits) -> list[str]:

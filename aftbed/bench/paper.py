@@ -603,11 +603,12 @@ def _piped(cells: Iterable[str]) -> str:
 
 
 class PaperPlot(msgspec.Struct, frozen=True):
-    """A drawing, and the names of its lines in the order of their styles."""
+    """A drawing, and the names of its lines, or bars, in the order of their styles."""
 
     title: str
     drawing: str
     lines: tuple[str, ...]
+    bars: bool = False
 
 
 def html_page(paper: Paper) -> str:
@@ -643,7 +644,7 @@ def _plots(paper: Paper) -> dict[str, list[PaperPlot]]:
     ]
     cpu = [(row.placement, row.rate_hz, row.usage.cpu_percent) for row in paper.load]
     return {
-        "times": [PaperPlot(title, plots.ranges(title, ranges), ("here", "the paper"))],
+        "times": [PaperPlot(title, plots.ranges(title, ranges), ("here", "the paper"), bars=True)],
         "state": [
             *_sweep("Cycle, p50", cycles, "state", "us", size),
             *_sweep("Blackout of an update, p50", updates, "state", "ms", size),

@@ -36,7 +36,9 @@ from aftbed.campaign.spec import (
 )
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.ftm.compose import EXPRESSIONS, build, replication_of
+from aftbed.ftm.compose import build, expressions, replication_of
+from aftbed.ftm.compose import parse as parse_ftm
+from aftbed.ftm.registry import packages_of
 from aftbed.functions.request_file import names_function, read_requests
 from aftbed.functions.source import renamed
 from aftbed.inject.memory import refuse_unsafe
@@ -130,7 +132,8 @@ def plan(spec: Spec, trust: Trust = NOBODY) -> CampaignPlan:
         raise ConfigError("mechanisms: no entry of faults and adaptations is left for any of them")
     content = msgspec.json.encode(spec, order="deterministic") + _content(spec)
     digest = hashlib.sha256(content).hexdigest()[:ID_DIGITS]
-    made = CampaignPlan(spec, digest, code_version(), strata)
+    packages = packages_of(name for ftm in spec.mechanisms for name in parse_ftm(ftm))
+    made = CampaignPlan(spec, digest, code_version(packages), strata)
     for stratum in strata:
         _check_faults(made, stratum)
         _check_adaptations(made, stratum)
@@ -265,7 +268,7 @@ def resolved(spec: Spec, trust: Trust) -> Spec:
 
 def suited(spec: Spec, declared: Characteristics) -> Spec:
     """`spec`, whose mechanisms are `suitable`, for a function that declares this. Raises ConfigError."""
-    suit = tuple(ftm for ftm in EXPRESSIONS if not unsuitable(ftm, declared))
+    suit = tuple(ftm for ftm in expressions() if not unsuitable(ftm, declared))
     faults = tuple(_for_known(spec, entry, suit, declared) for entry in spec.faults)
     left = tuple(entry for entry in faults if entry is not None)
     spec = _with_each_adaptation(msgspec.structs.replace(spec, mechanisms=suit, faults=left), declared)
@@ -281,7 +284,7 @@ def _for_known(
 
     Raises ConfigError where no mechanism at all knows them: then they are wrong.
     """
-    meant = [ftm for ftm in EXPRESSIONS if means(entry.mechanisms, ftm)]
+    meant = [ftm for ftm in expressions() if means(entry.mechanisms, ftm)]
     refused = {ftm: why for ftm in meant if (why := unknown_words(spec, entry, ftm)) is not None}
     if len(refused) == len(meant):
         raise refused[meant[0]]

@@ -29,7 +29,7 @@ is any other. An outcome that is better than the expected ones counts as unexpec
 sees anything is no oracle.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Final, Literal
@@ -44,12 +44,12 @@ from aftbed.core.graph import PLACEMENTS
 from aftbed.core.requirements import check_requirements
 from aftbed.core.script import RECIPES
 from aftbed.core.yaml_file import read_yaml
-from aftbed.ftm.compose import EXPRESSIONS
+from aftbed.ftm.compose import expressions, is_listed
 from aftbed.functions.request_file import located_requests
 from aftbed.functions.source import located
 from aftbed.judge.outcome import OUTCOMES
 from aftbed.runtime.unix.options import CarRun, LoadRun, ftti_ms_of
-from aftbed.vehicle.scenarios.library import load_scenario
+from aftbed.vehicle.scenarios.library import load_scenario, located_scenario
 
 SHIPPED: Final = Path(__file__).resolve().parent.parent / "campaigns"
 ANY: Final = "*"
@@ -90,29 +90,29 @@ Share = Annotated[float, Meta(gt=0, lt=1)]
 class System(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What the mechanisms protect: `app` ("": the brake), asked for `requests` of a load, or by a car.
 
-    `request_file`: what is sent, as `--requests` has it; behind the last of a file comes the first. It and
-    `app` are looked up beside the campaign file.
+    `request_file`: what is sent, as `--requests` has it; behind the last of a file comes the first. Relative
+    paths are looked up beside the campaign file, and then in the current directory.
     """
 
-    app: str = ""
+    app: str = ""  # the protected function, as --app has it; none: the brake
     request_file: str = ""
-    requests: Annotated[int, Meta(ge=1, le=REQUESTS_MAX)] = 100
+    requests: Annotated[int, Meta(ge=1, le=REQUESTS_MAX)] = 100  # of each experiment without a car
     rate_hz: Annotated[float, Meta(ge=0, le=RATE_HZ_MAX)] = 0.0  # 0: the next follows the reply
-    scenario: str = ""
-    placements: tuple[str, ...] = ("process",)
-    runtime: Literal["unix", "sim"] = "unix"
+    scenario: str = ""  # a car asks, instead of requests
+    placements: tuple[str, ...] = ("process",)  # process, replica, single
+    runtime: Literal["unix", "sim"] = "unix"  # real processes, or the simulator
     unsafe_memory: bool = False  # faults may strike any memory of a node
 
 
 class FaultEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """`fault` in the words of `--inject`, `{name}`s filled in; several strike in the same run."""
 
-    name: str
-    fault: str | tuple[str, ...] = ()
-    matrix: dict[str, tuple[Value, ...]] = {}
-    draw: dict[str, tuple[int, int]] = {}
+    name: str  # of its strata
+    fault: str | tuple[str, ...] = ()  # the words of --inject with {name}s in them; several strike in one run
+    matrix: dict[str, tuple[Value, ...]] = {}  # values of a {name}: each of them, in turn
+    draw: dict[str, tuple[int, int]] = {}  # least and most of a {name}: one of them, by the seed
     mechanisms: tuple[str, ...] = ()  # where not all; patterns as of file names
-    expect: dict[str, tuple[str, ...]] = {}
+    expect: dict[str, tuple[str, ...]] = {}  # outcomes by mechanism, or by patterns of them; "*" is any other
     may_miss: bool = False  # there may be nothing to strike: a stratum where nothing struck is no failure
 
     @property
@@ -130,10 +130,10 @@ class FaultEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class AdaptationEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """`adapt` in the words of `--adapt`; in each run, one after the other."""
 
-    name: str
-    adapt: str | tuple[str, ...] = ()
-    recipe: str = RECIPES[0]
-    mechanisms: tuple[str, ...] = ()
+    name: str  # of its strata
+    adapt: str | tuple[str, ...] = ()  # words of --adapt; {mechanism}: each other one, {app}: the function
+    recipe: str = RECIPES[0]  # drained or paper
+    mechanisms: tuple[str, ...] = ()  # where not all; patterns as of file names
     faults: tuple[str, ...] = ()  # entries of `faults`, where not all; patterns, too
 
     @property
@@ -151,9 +151,9 @@ class StopRule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     experiments: Positive = 20  # per stratum
     half_width: Share | None = None
-    looks: Annotated[int, Meta(ge=1, le=20)] = 4
-    minutes: Annotated[float, Meta(gt=0, le=100_000)] | None = None
-    first_failure: bool = False
+    looks: Annotated[int, Meta(ge=1, le=20)] = 4  # each after an equal part of experiments
+    minutes: Annotated[float, Meta(gt=0, le=100_000)] | None = None  # of the campaign
+    first_failure: bool = False  # one failure ends it
 
 
 class Gate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -164,33 +164,33 @@ class Gate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     by what was measured: not one may be seen.
     """
 
-    metric: str
-    max: float | None = None
-    min: float | None = None
+    metric: str  # an outcome, unexpected, fhti_ms_p99, ...
+    max: float | None = None  # what it may be at most
+    min: float | None = None  # what it must be at least
     strata: str = ANY  # a pattern as of file names
 
 
 class Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A campaign file, key by key."""
 
-    campaign: Annotated[str, Meta(pattern="^[a-z0-9][a-z0-9-]{0,40}$")]
-    mechanisms: Annotated[tuple[str, ...], Meta(min_length=1)]
-    faults: Annotated[tuple[FaultEntry, ...], Meta(min_length=1)]
-    about: str = ""
-    seed: Annotated[int, Meta(ge=0)] = 0
-    system: System = System()
-    adaptations: tuple[AdaptationEntry, ...] = (AdaptationEntry("none"),)
+    campaign: Annotated[str, Meta(pattern="^[a-z0-9][a-z0-9-]{0,40}$")]  # its name
+    mechanisms: Annotated[tuple[str, ...], Meta(min_length=1)]  # FTM expressions; or [suitable]
+    faults: Annotated[tuple[FaultEntry, ...], Meta(min_length=1)]  # what strikes, and what is expected
+    about: str = ""  # for people
+    seed: Annotated[int, Meta(ge=0)] = 0  # the same seed draws the same experiments
+    system: System = System()  # what the mechanisms protect
+    adaptations: tuple[AdaptationEntry, ...] = (AdaptationEntry("none"),)  # in each experiment
     leave_out: tuple[str, ...] = ()  # strata, by patterns as of file names
-    stop: StopRule = StopRule()
-    gates: tuple[Gate, ...] = ()
-    confidence: Annotated[float, Meta(gt=0.5, lt=1)] = 0.95
+    stop: StopRule = StopRule()  # when enough is known
+    gates: tuple[Gate, ...] = ()  # what fails the campaign
+    confidence: Annotated[float, Meta(gt=0.5, lt=1)] = 0.95  # of all intervals
     recovery_budget_ms: Annotated[float, Meta(gt=0)] | None = None  # longer is `degraded`
     sometimes: tuple[str, ...] = ()  # each a `RunState` that at least one experiment must have been in
     verifies: tuple[str, ...] = ()  # requirements; as it is read, those of the scenario too
     ftti: str = ""  # as 100ms, of bus time: a fault that is handled later breaks a promise
     bounded: bool = False  # an FHTI above its bound fails the campaign on real processes, too
     not_activated_max: Annotated[float, Meta(ge=0, le=1)] = 0.3  # two gates that are always there (G8)
-    unknown_max: Annotated[float, Meta(ge=0, le=1)] = 0.3
+    unknown_max: Annotated[float, Meta(ge=0, le=1)] = 0.3  # share of those of which nothing is known
 
     @property
     def ftti_ms(self) -> float:
@@ -209,13 +209,7 @@ def read_spec(name: str) -> Spec:
             raise unknown("campaign", name, shipped())
     spec = read_yaml(path, Spec)
     try:
-        if spec.system.app:
-            system = msgspec.structs.replace(spec.system, app=located(spec.system.app, path.parent))
-            spec = msgspec.structs.replace(spec, system=system)
-        if spec.system.request_file:
-            source = located_requests(spec.system.request_file, path.parent)
-            system = msgspec.structs.replace(spec.system, request_file=source)
-            spec = msgspec.structs.replace(spec, system=system)
+        spec = msgspec.structs.replace(spec, system=_located(spec.system, path.parent))
         check(spec)
         if spec.system.scenario:  # here, since records are reported where the scenario's file is not
             verifies = dict.fromkeys((*spec.verifies, *load_scenario(spec.system.scenario).verifies))
@@ -223,6 +217,39 @@ def read_spec(name: str) -> Spec:
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
     return spec
+
+
+_Locator = Callable[[str, Path], str]
+
+
+def _located(system: System, folder: Path) -> System:
+    """With absolute paths, of files in `folder` or else in the current directory. Raises ConfigError."""
+    locators: dict[str, _Locator] = {
+        "app": located,
+        "request_file": located_requests,
+        "scenario": located_scenario,
+    }
+    found = {}
+    for key, locate in locators.items():
+        if text := getattr(system, key):
+            try:
+                found[key] = _beside_or_here(text, folder, locate)
+            except ConfigError as error:
+                raise ConfigError(f"system.{key}: {error}") from error
+    return msgspec.structs.replace(system, **found)
+
+
+def _beside_or_here(text: str, folder: Path, locate: _Locator) -> str:
+    here = Path.cwd()
+    try:
+        return locate(text, folder)
+    except ConfigError as error:
+        if folder.resolve() == here:
+            raise
+        try:
+            return locate(text, here)
+        except ConfigError:
+            raise ConfigError(f"{error}, beside the campaign file or in {here}") from error
 
 
 def shipped() -> list[str]:
@@ -233,7 +260,9 @@ def shipped() -> list[str]:
 def check(spec: Spec) -> None:
     """Check what the types do not express. Raises ConfigError naming the key."""
     if spec.mechanisms != (SUITABLE,):
-        _each_known("mechanisms", spec.mechanisms, (*EXPRESSIONS, SUITABLE))
+        for name in spec.mechanisms:
+            if name != SUITABLE and not is_listed(name):
+                raise ConfigError(f"mechanisms: {unknown('name', name, (*expressions(), SUITABLE))}")
         if SUITABLE in spec.mechanisms:
             raise ConfigError(f"mechanisms: {SUITABLE!r} stands alone: they are all that suit the function")
     _each_known("sometimes", spec.sometimes, tuple(state.value for state in RunState))
@@ -272,7 +301,7 @@ def check(spec: Spec) -> None:
 
 def mechanisms_of(spec: Spec) -> tuple[str, ...]:
     """Those that may be named in entries."""
-    return EXPRESSIONS if spec.mechanisms == (SUITABLE,) else spec.mechanisms
+    return expressions() if spec.mechanisms == (SUITABLE,) else spec.mechanisms
 
 
 def means(patterns: tuple[str, ...], name: str) -> bool:

@@ -30,7 +30,7 @@ from aftbed.campaign.plan import Stratum, strata_of, unknown_words
 from aftbed.campaign.spec import Spec
 from aftbed.campaign.statistics import Interval, proportion
 from aftbed.core.application import Characteristics
-from aftbed.ftm.compose import EXPRESSIONS, NONE, parse, replication_of
+from aftbed.ftm.compose import NONE, expressions, parse, replication_of
 from aftbed.ftm.registry import MECHANISMS
 from aftbed.inject.model import parse as parse_fault
 from aftbed.judge.outcome import OUTCOMES, UNKNOWN
@@ -265,7 +265,7 @@ def _of_suitability(
         crash=any(fault.action.stops_process for fault in faults),
         value=any(fault.action.alters_value for fault in faults),
     )
-    promised = [ftm for ftm in EXPRESSIONS if not problems(ftm, asked, Characteristics(), AMPLE)]
+    promised = [ftm for ftm in expressions() if not problems(ftm, asked, Characteristics(), AMPLE)]
     tried = [ftm for ftm in promised if ftm in faulty]
     others = [ftm for ftm in promised if ftm not in spec.mechanisms]
     if tried:

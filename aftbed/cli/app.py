@@ -20,6 +20,8 @@ COMMANDS: Final[CommandTable] = {
     "adapt": ("adapt:adapt", "Change the mechanism of a live run: update, switch, compose."),
     "bench": ("bench:bench", "Measure, with the bare limit measured beside each figure."),
     "ftm": ("ftm:ftm", "What each mechanism tolerates and needs, and which one suits."),
+    "init": ("init:init", "Write a file or a project to begin with: scenario, campaign, mechanism, ..."),
+    "schema": ("schema:schema", "The JSON Schema of a kind of YAML file, for editors."),
     "app": ("function:function", "The protected function of a user: what it declares, measured."),
     "explore": ("explore:explore", "Simulate every experiment of one kind, with an exact count."),
     "campaign": (
@@ -32,6 +34,8 @@ COMMANDS: Final[CommandTable] = {
         "scenario:scenario",
         "Drives and published tables: what must stop, and what still does under faults.",
     ),
+    "completion": ("completion:completion", "Have bash, zsh or fish complete words: the script for it."),
+    "man": ("manual:man", "The manual page: commands, options, exit codes, files."),
 }
 
 

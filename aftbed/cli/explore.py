@@ -11,7 +11,7 @@ import typer
 from msgspec.structs import replace
 
 from aftbed.cli.adapt import refuse_unsuitable
-from aftbed.cli.options import App, Json, check_range, jobs_of, print_json, separated, takes
+from aftbed.cli.options import App, Json, check_range, jobs_of, note_unusable, print_json, separated, takes
 from aftbed.cli.parsing import PlainGroup
 from aftbed.cli.request_options import RequestSource, first_requests
 from aftbed.cli.sim import described, event_lines, picture, shown_apart
@@ -136,6 +136,8 @@ def _selection(explorer: str, given: NumberedArguments) -> Selection:
 def _explore(explorer: str, given: NumberedArguments) -> int:
     jobs, began_s = jobs_of(given.jobs), time.monotonic()
     selection = _selection(explorer, given)
+    if not given.ftm:
+        note_unusable()
     apart = bool(selection.application)
     # How many points a run has is found by simulating it.
     setups = once(_setups, selection, own_seconds_max(REQUESTS_MAX), apart=apart)

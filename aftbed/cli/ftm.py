@@ -26,12 +26,12 @@ from aftbed.adapt.suitability import (
     table_from,
 )
 from aftbed.cli.lazy import CommandTable, group_of
-from aftbed.cli.options import Json, check_range, print_blocks, print_json
+from aftbed.cli.options import Json, check_range, note_unusable, print_blocks, print_json
 from aftbed.core.application import NONE
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
 from aftbed.core.yaml_file import read_yaml
-from aftbed.ftm.compose import EXPRESSIONS, build
+from aftbed.ftm.compose import build, expressions
 from aftbed.functions.source import located
 from aftbed.judge.isolated import declared_by
 from aftbed.runtime.unix.trust import OWN_RUN
@@ -65,11 +65,13 @@ def table_of(path: str | None) -> SuitabilityTable:
 def list_(table: TableOption = None, json: Json = False) -> None:
     """Every FTM expression: what it tolerates and needs, and how many processes it takes."""
     rules = table_of(table)
-    found = [(demand(name, rules), build(name, "process")) for name in EXPRESSIONS]
+    found = [(demand(name, rules), build(name, "process")) for name in expressions()]
+    note_unusable()
     if json:
         print_json([_summary(*one) for one in found])
         return
-    line = "{:<12}{:<28}{:<15}{:<14}{:>4}  {:<10}{:<11}{:>9}".format
+    width = max(12, *(len(wanted.ftm) + 2 for wanted, _ in found))
+    line = f"{{:<{width}}}{{:<28}}{{:<15}}{{:<14}}{{:>4}}  {{:<10}}{{:<11}}{{:>9}}".format
     print(line("FTM", "TOLERATES", *COLUMNS))
     for wanted, graph in found:
         needs = ("needed" if sentences else "-" for sentences in (wanted.deterministic, wanted.state_access))
@@ -131,6 +133,7 @@ def check(
     built_in = default_application().characteristics
     declared = built_in if app is None else declared_by(located(app), OWN_RUN)
     resources = _resources(cpus, cpu_load, bandwidth)
+    note_unusable()
     others = consistent(model, declared, resources, rules)
     found = [] if expression is None else problems(expression, model, declared, resources, rules)
     notes = [] if expression is None or found else remarks(expression, declared)

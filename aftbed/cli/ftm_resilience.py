@@ -16,7 +16,7 @@ from aftbed.bench.adaptation import AdaptationTime, Pair, bench_pairs, read_time
 from aftbed.cli.ftm import TableOption, table_of
 from aftbed.cli.options import Json, check_range, print_json, takes
 from aftbed.core.errors import ConfigError
-from aftbed.ftm.registry import MECHANISMS
+from aftbed.ftm.registry import SHIPPED
 
 ADAPTATIONS: Final = 3  # of each kind
 ADAPTATIONS_MAX: Final = 1000
@@ -45,7 +45,7 @@ class ResilienceArguments(msgspec.Struct, frozen=True):
 
     mechanisms: Annotated[
         str, typer.Option("--set", help="The mechanisms there are, with commas; what they compose is added.")
-    ] = ",".join(MECHANISMS)
+    ] = ",".join(SHIPPED)
     adaptations: Annotated[
         int, typer.Option(help="Of each kind, measured on real processes; 0: measure nothing.")
     ] = ADAPTATIONS

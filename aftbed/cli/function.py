@@ -11,12 +11,12 @@ import typer
 
 from aftbed import functions
 from aftbed.adapt.suitability import mismatches
-from aftbed.cli.new_function import new
-from aftbed.cli.options import Json, Seed, check_range, check_seed, print_blocks, print_json
+from aftbed.cli.init import new
+from aftbed.cli.options import Json, Seed, check_range, check_seed, note_unusable, print_blocks, print_json
 from aftbed.cli.parsing import PlainGroup
 from aftbed.core.application import NONE, Characteristics
 from aftbed.core.errors import shown
-from aftbed.ftm.compose import EXPRESSIONS
+from aftbed.ftm.compose import expressions
 from aftbed.functions.load import OWN_CODE
 from aftbed.functions.request_file import located_requests, requests_from
 from aftbed.functions.source import is_foreign, located, parse_source
@@ -54,7 +54,8 @@ def check(
         found = measure(place, payloads, seed)
     except UnmeasuredError as error:
         raise UnmeasuredError(f"{error} ({OF_THE_BRAKE})" if requests is None else str(error)) from None
-    reasons = {name: "; ".join(mismatches(name, found.characteristics)) for name in EXPRESSIONS}
+    note_unusable()
+    reasons = {name: "; ".join(mismatches(name, found.characteristics)) for name in expressions()}
     if json:
         print_json(_document(source, found, reasons))
         for one in found.differences:

@@ -25,9 +25,11 @@ from aftbed.runtime.unix.options import Work, with_names_resolved
 class InjectGroup(PlainGroup):
     """Takes the words of a fault as one argument too, as `run --inject` does."""
 
+    WHOLE = "fault"  # the command that takes them
+
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         whole = args and " " in args[0]
-        return super().parse_args(ctx, ["fault", *args] if whole else args)
+        return super().parse_args(ctx, [self.WHOLE, *args] if whole else args)
 
 
 inject = typer.Typer(cls=InjectGroup)

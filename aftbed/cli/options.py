@@ -12,7 +12,7 @@ from typing import Annotated, Final, Generic, TypeVar, get_args, get_origin
 import msgspec
 import typer
 
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, shown
 from aftbed.core.requirements import check_requirements
 
 SEED_MAX: Final = 2**63 - 1
@@ -98,6 +98,14 @@ def _parameter(field: msgspec.structs.FieldInfo) -> inspect.Parameter:
     return inspect.Parameter(
         field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
     )
+
+
+def note_unusable() -> None:
+    """Where all mechanisms are listed: tell which packages have one that cannot be used, and why."""
+    from aftbed.ftm.compose import load_installed  # noqa: PLC0415 - commands without mechanisms need it not
+
+    for why in load_installed():
+        print(f"aftbed: note: {shown(why)}", file=sys.stderr)
 
 
 def separated(given: tuple[str, ...]) -> tuple[str, ...]:

@@ -63,6 +63,7 @@ from aftbed.runtime.unix.options import (
     Work,
     ftti_ms_of,
 )
+from aftbed.vehicle.can.bus_load import BITRATE_BPS, BITRATE_BPS_MAX, BITRATE_BPS_MIN
 
 if TYPE_CHECKING:
     from aftbed.cli.request_options import RequestSource
@@ -151,6 +152,9 @@ class RunArguments(msgspec.Struct, frozen=True):
             "--bus-open", help="Let other users onto the bus; what strangers send is part of the run."
         ),
     ] = False
+    bitrate: Annotated[
+        int, typer.Option(help="Bits per second by which the load of the bus is measured.")
+    ] = BITRATE_BPS
     pin: Annotated[bool, typer.Option(help="Keep each replica's chain on one core.")] = True
     unsafe_memory: Annotated[
         bool, typer.Option("--unsafe-memory", help='Allow --inject "bitflip memory ...".')
@@ -171,7 +175,7 @@ class RunArguments(msgspec.Struct, frozen=True):
 DEFAULTS: Final = RunArguments()
 OF_A_REPLAY: Final = ("dbc", "map_file", "skip_bad", "loop")
 OTHER_SOURCES: Final = ("load", "replay", *OF_A_REPLAY, "scenario", "pace", "brake_policy")
-OF_THE_BUS: Final = ("bus_port", "bus_open", "duration")
+OF_THE_BUS: Final = ("bus_port", "bus_open", "bitrate", "duration")
 
 
 @takes(RunArguments)
@@ -202,6 +206,7 @@ def execute(given: RunArguments) -> int:
     if application:
         _refuse_unsuitable(application, graph.ftm, requests, force=given.force)
     check_range("--bus-port", given.bus_port, 0, 65535)
+    check_range("--bitrate", given.bitrate, BITRATE_BPS_MIN, BITRATE_BPS_MAX)
     verifies = requirements(given.verifies)
     check_file("--junit", given.junit)
     check_file("--html", given.html)
@@ -317,8 +322,7 @@ def _work(given: RunArguments) -> Work:
         _refuse(
             given, ("scenario", "pace", "brake_policy", *OF_A_REPLAY), "--load: there is no car: leave out"
         )
-        if given.bus_open:
-            raise ConfigError("--bus-open: a run of --load has no bus")
+        _refuse(given, ("bus_open", "bitrate"), "--load: there is no bus: leave out")
         if given.duration is not None:
             raise ConfigError("--duration: a run of --load ends with its last request; COUNT says how many")
         return _load(given.load)
@@ -329,14 +333,14 @@ def _work(given: RunArguments) -> Work:
         if given.loop and pace is None and duration_ms is None:
             raise ConfigError("--loop with --pace max would fill the disk: give --duration too")
         files = _replay_files(given.replay, given.dbc, given.map_file)
-        return ReplayRun(*files, pace, given.loop, duration_ms)
+        return ReplayRun(*files, pace, given.loop, duration_ms, given.bitrate)
     _refuse(given, OF_A_REPLAY, "only with --replay LOG: leave out")
     if given.brake_policy not in POLICIES:
         raise unknown("brake policy", given.brake_policy, POLICIES)
     scenario = given.scenario
     if scenario.endswith((".yaml", ".yml")):
         scenario = str(Path(scenario).resolve())
-    return CarRun(scenario, pace, given.brake_policy, duration_ms)
+    return CarRun(scenario, pace, given.brake_policy, duration_ms, given.bitrate)
 
 
 def _replay_files(log: str, dbc_name: str | None, map_name: str | None) -> tuple[str, str, str]:

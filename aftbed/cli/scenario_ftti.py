@@ -15,7 +15,7 @@ from aftbed.cli.options import Json, Seed, check_file, check_seed, jobs_of, prin
 from aftbed.cli.views import progress_bar
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED
-from aftbed.report.plots import TimeBand, ftti_plot
+from aftbed.report.plots import FttiCurve, TimeBand, ftti_plot
 from aftbed.search.ftti import (
     FTTI_MAX_MS,
     Fhti,
@@ -127,20 +127,19 @@ def _fhti(path: Path | None) -> dict[str, Fhti]:
 
 
 def _plot(path: Path, policy: str, rows: Sequence[FttiRow], figures: dict[str, Fhti]) -> None:
-    lines: dict[str, list[tuple[float, float]]] = {}
-    for row in sorted(rows, key=lambda row: row.speed_kmh):
-        if row.ftti_ms is not None:
-            lines.setdefault(f"FTTI, {row.fault}", []).append((row.speed_kmh, row.ftti_ms))
-        if row.closed_form_ms is not None:
-            form = lines.setdefault("closed form", [])
-            form += [(row.speed_kmh, row.closed_form_ms)] if row.speed_kmh not in dict(form) else []
-    if not lines:
+    curves = []
+    for fault in dict.fromkeys(row.fault for row in rows if row.ftti_ms is not None):
+        of = sorted((row for row in rows if row.fault == fault), key=lambda row: row.speed_kmh)
+        points = [(row.speed_kmh, row.ftti_ms) for row in of if row.ftti_ms is not None]
+        closed = [(row.speed_kmh, row.closed_form_ms) for row in of if row.closed_form_ms is not None]
+        curves.append(FttiCurve(fault, points, closed))
+    if not curves:
         raise ConfigError(
             f"--plot {path}: no FTTI up to {FTTI_MAX_MS // 1000} s, so there is nothing to draw"
         )
     bands = [TimeBand(name, of.p50, of.p99 if of.bound is None else of.bound) for name, of in figures.items()]
     try:
-        path.write_text(ftti_plot(f"FTTI over speed, brakes: {policy}", lines, bands), encoding="utf-8")
+        path.write_text(ftti_plot(f"FTTI over speed, brakes: {policy}", curves, bands), encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"--plot {path}: {error.strerror}") from None
 

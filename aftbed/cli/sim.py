@@ -137,7 +137,8 @@ class SimArguments(msgspec.Struct, frozen=True):
         None
     )
     diagram: Annotated[
-        str | None, typer.Option(help="Write the last messages to this file, as a Mermaid diagram.")
+        str | None,
+        typer.Option(help="Draw faults and what is around them: .svg is a space-time diagram, else Mermaid."),
     ] = None
     against: Annotated[
         tuple[Path, ...],
@@ -446,10 +447,10 @@ def _quoted(text: str) -> str:
 
 
 class Picture(NamedTuple):
-    """The last messages of a run before its first breach, as lines of text and as Mermaid."""
+    """A run drawn: the last messages before its first breach as lines of text, and a diagram."""
 
     lines: list[str]
-    mermaid: str
+    diagram: str = ""
 
 
 def _attempt(*, swarm: bool) -> Attempt:
@@ -457,15 +458,19 @@ def _attempt(*, swarm: bool) -> Attempt:
     return attempt_drawn if swarm else attempt_own
 
 
-def picture(setup: Setup, broken: tuple[Breach, ...]) -> Picture:
-    """Simulates `setup` again, traced. Empty if the executive itself failed."""
+def picture(setup: Setup, broken: tuple[Breach, ...], path: str | None = None) -> Picture:
+    """Simulates `setup` again, traced. Empty if the executive itself failed. `path`: of the diagram."""
     if attempt_own(setup)[0] is None:
-        return Picture([], "")
+        return Picture([])
     trace = traced(setup, code=OWN_CODE)
-    return Picture(
-        sequence.listing(trace, broken).rstrip().splitlines(),
-        sequence.mermaid(trace, broken),
-    )
+    lines = sequence.listing(trace, broken).rstrip().splitlines()
+    if path is None:
+        return Picture(lines)
+    if not path.endswith(".svg"):
+        return Picture(lines, sequence.mermaid(trace, broken))
+    from aftbed.report.html import space_time_svg  # noqa: PLC0415 - Jinja2, only for --diagram
+
+    return Picture(lines, space_time_svg(sequence.space_time(trace)))
 
 
 class BrokenRun(NamedTuple):
@@ -580,9 +585,9 @@ def _simulate_one(given: SimArguments, setup: Setup) -> int:
             print("\n".join(done.lines(wall_ms, tally)))
             show_verdict(done.verdict, as_json=False)
     found = broken_run(setup, broken, swarm=given.swarm) if broken else None
-    drawing = picture(setup, broken) if broken or given.diagram is not None else Picture([], "")
+    drawing = picture(setup, broken, given.diagram) if broken or given.diagram is not None else Picture([])
     if given.diagram is not None:
-        Path(given.diagram).write_text(drawing.mermaid)
+        Path(given.diagram).write_text(drawing.diagram)
     if given.json:
         about = {"seed": setup.seed, "verdict": word, "setup": described(setup), "missed": lacking}
         breach = found.document() if found is not None else {"breaches": [], "command": None, "shrunk": None}
@@ -658,8 +663,8 @@ class _ManyRuns:
         ]
         if given.diagram is not None and self._broken:
             broken_setup, breaches = self._broken[0]
-            drawing = self._simulated_again(partial(picture, broken=breaches), broken_setup)
-            Path(given.diagram).write_text(drawing.mermaid)
+            draw = partial(picture, broken=breaches, path=given.diagram)
+            Path(given.diagram).write_text(self._simulated_again(draw, broken_setup).diagram)
         elif given.diagram is not None:
             print(f"aftbed: note: nothing broke: {given.diagram} is not written", file=sys.stderr)
         self._show(broken, (first, first + self._runs - 1), max(took_s, 1e-9))

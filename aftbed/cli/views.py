@@ -24,7 +24,6 @@ from aftbed.vehicle.plant import Telemetry
 if TYPE_CHECKING:
     from aftbed.judge.verdict import Verdict
     from aftbed.vehicle.aeb.messages import Sight
-    from aftbed.vehicle.can.hub import Stranger
 
 STAGES: Final = ("-", "WARN", "PARTIAL", "FULL")
 PLAIN_PERIOD_MS: Final = 500
@@ -192,8 +191,12 @@ def _show_run(verdict: "Verdict") -> None:
         print(shown(f"  at the end {verdict.ftm_at_end or 'unknown'}"))
     if verdict.policy is not msgspec.UNSET:
         _show_policy(verdict)
-    for stranger in verdict.strangers:
-        print(f"  bus        {_stranger_line(stranger)}")
+    if (load := verdict.bus_load) is not None:
+        print(f"  bus load   {load.p50_percent:.1f} % (p50), {load.max_percent:.1f} % at most")
+    if verdict.strangers:
+        from aftbed.judge.checks import stranger_line  # noqa: PLC0415 - after the run
+
+        print("\n".join(f"  bus        {stranger_line(stranger)}" for stranger in verdict.strangers))
     for fault in verdict.faults:
         print(shown(f"  fault      {fault.fault}: {fault.receipt.value}"))
     if verdict.verifies:
@@ -209,23 +212,6 @@ def _show_policy(verdict: "Verdict") -> None:
         print(shown(f"  policy     {rule_line(rule)}"))
     for proposal in verdict.proposals or ():
         print(shown(f"  proposal   {proposed_line(proposal)}"))
-
-
-def _stranger_line(one: "Stranger") -> str:
-    from aftbed.judge.checks import counted  # noqa: PLC0415 - after the run
-
-    forged = f" (forged: {counted(one.forged)})" if one.forged else ""
-    figures = (
-        (one.connections, "on the bus"),
-        (one.turned_away, "turned away"),
-        (one.frames, f"frames{forged}"),
-        (one.refused, "elements refused"),
-        (one.commands_refused, "of them commands"),
-        (one.put_out_fast, "put out as too fast"),
-        (one.put_out_slow, "put out as too slow"),
-        (one.put_out_oversized, "put out for an element over the limit"),
-    )
-    return f"{one}: " + ", ".join(f"{count} {what}" for count, what in figures if count)
 
 
 def _show_vehicle(verdict: "Verdict") -> None:

@@ -78,7 +78,7 @@ def approximate(tolerance: float) -> StateAccess:
 
 
 class ApproximateAccess(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    approximate: Annotated[float, Meta(gt=0)]
+    approximate: Annotated[float, Meta(gt=0)]  # by so much replies may differ behind a restored state
 
 
 WrittenAccess = Literal["exact", "none"] | ApproximateAccess  # as files and programs write it

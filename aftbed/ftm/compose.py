@@ -9,21 +9,22 @@ paper's 17 processes of a duplex (23 when composed) are the nodes made here and 
 the place of the ROS master.
 """
 
-import contextlib
 import itertools
+from functools import cache
 from typing import Final
 
 import msgspec
 
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph, Link
+from aftbed.ftm import registry
 from aftbed.ftm.declaration import FaultClass
-from aftbed.ftm.registry import BRICKS, KINDS, MECHANISMS, REPLY_CHECKERS
+from aftbed.ftm.registry import BRICKS, ENGINE, KINDS, MECHANISMS, SHIPPED
 
 REPLICAS: Final = ("a", "b")
 NONE: Final = "none"
-DUPLEX: Final = tuple(name for name, row in MECHANISMS.items() if row.replication)
-SIMPLEX: Final = tuple(name for name, row in MECHANISMS.items() if not row.replication)
+DUPLEX: Final = tuple(name for name in SHIPPED if MECHANISMS[name].replication)
+SIMPLEX: Final = tuple(name for name in SHIPPED if not MECHANISMS[name].replication)
 STATEFUL: Final = ("protocol", "server")  # the parts whose state a new backup needs
 ONWARD: Final = ("pro2bfr", "bfr2prd", "prd2aft", "pro2pxy")  # the way of a request, the nearest first
 
@@ -38,11 +39,11 @@ def parse(expression: str) -> tuple[str, ...]:
         return ()
     names = tuple(expression.split("+"))
     for name in names:
-        if name not in MECHANISMS:
-            raise unknown("FTM", name, (NONE, *MECHANISMS))
+        if registry.find(name) is None:
+            raise unknown("FTM", name, (NONE, *registry.names()))
     for index, name in enumerate(names):
-        if MECHANISMS[name].replication and index > 0:
-            meant = "+".join((name, *(n for n in names if n not in DUPLEX)))
+        if replicates(name) and index > 0:
+            meant = "+".join((name, *(n for n in names if not replicates(n))))
             raise ConfigError(f"{expression}: {name} replicates, so it can only be outermost ({meant}?)")
         if MECHANISMS[name].innermost and index < len(names) - 1:
             meant = "+".join((*(n for n in names if n != name), name))
@@ -59,16 +60,34 @@ def canonical(expression: str) -> str:
     return "+".join(parse(expression)) or NONE
 
 
-def _expressions() -> tuple[str, ...]:
+def replicates(name: str) -> bool:
+    """Whether the mechanism `name`, which `parse` has found, sends to a second replica."""
+    return bool(MECHANISMS[name].replication)
+
+
+def _expressions(mechanisms: tuple[str, ...]) -> tuple[str, ...]:
     """Every expression of one or two mechanisms that makes sense and is listed, `none` first."""
-    found = [NONE, *DUPLEX, *SIMPLEX]
-    for outer, inner in itertools.product(MECHANISMS, SIMPLEX):
-        pair = f"{outer}+{inner}"
-        if outer in DUPLEX or (MECHANISMS[outer].combined and MECHANISMS[inner].combined):
-            with contextlib.suppress(ConfigError):
-                parse(pair)
-                found.append(pair)
-    return tuple(found)
+    duplex = [name for name in mechanisms if replicates(name)]
+    simplex = [name for name in mechanisms if not replicates(name)]
+    pairs = (f"{outer}+{inner}" for outer, inner in itertools.product(mechanisms, simplex))
+    return (NONE, *duplex, *simplex, *filter(is_listed, pairs))
+
+
+def is_listed(expression: str) -> bool:
+    """Whether it is `none`, one mechanism, or a pair that makes sense and is listed.
+
+    Raises ConfigError where a package that declares a mechanism in it cannot be used.
+    """
+    names = expression.split("+") if expression != NONE else []
+    if not all(registry.find(name) for name in names):
+        return False
+    try:
+        parse(expression)
+    except ConfigError:
+        return False
+    return len(names) < 2 or (
+        len(names) == 2 and (replicates(names[0]) or all(MECHANISMS[name].combined for name in names))
+    )
 
 
 def chain(graph: Graph, replica: str) -> tuple[str, ...]:
@@ -110,10 +129,49 @@ def hops(graph: Graph) -> int:
     return sum(a != b for a, b in itertools.pairwise(graph.node_of(name) for name in path(graph)))
 
 
-EXPRESSIONS: Final = _expressions()
-DUPLEX_EXPRESSIONS: Final = tuple(  # each mechanism that replicates, alone and around each other one
-    "+".join((outer, *inner)) for inner in ((), *((name,) for name in SIMPLEX)) for outer in DUPLEX
-)
+def _around_each(mechanisms: tuple[str, ...]) -> tuple[str, ...]:
+    """Each mechanism that replicates, alone and around each other one."""
+    inside = ((), *((name,) for name in mechanisms if not replicates(name)))
+    outside = [name for name in mechanisms if replicates(name)]
+    return tuple("+".join((outer, *inner)) for inner in inside for outer in outside)
+
+
+EXPRESSIONS: Final = _expressions(SHIPPED)  # those of our own mechanisms: the same on every machine
+DUPLEX_EXPRESSIONS: Final = _around_each(SHIPPED)
+
+
+def expressions() -> tuple[str, ...]:
+    """EXPRESSIONS with those of the mechanisms of installed packages."""
+    load_installed()
+    return known_expressions()
+
+
+def known_expressions() -> tuple[str, ...]:
+    """EXPRESSIONS with those of the installed mechanisms that were asked for in this process."""
+    return EXPRESSIONS if len(MECHANISMS) == len(SHIPPED) else _expressions(_known())
+
+
+def _known() -> tuple[str, ...]:
+    return tuple(name for name in registry.names() if name in MECHANISMS)
+
+
+def duplex_expressions() -> tuple[str, ...]:
+    """DUPLEX_EXPRESSIONS with those of the mechanisms of installed packages."""
+    load_installed()
+    return _around_each(_known())
+
+
+@cache
+def load_installed() -> tuple[str, ...]:
+    """Find the mechanisms of all installed packages; why some cannot be used, a sentence each."""
+    found = registry.load_installed()
+    for name in registry.installed_mechanisms():
+        try:
+            build(name, PLACEMENTS[0])
+        except ConfigError as error:
+            registry.leave_out(name, error)
+            found.append(str(error))
+    return tuple(found)
 
 
 def tolerates(expression: str, fault: FaultClass) -> bool:
@@ -141,8 +199,10 @@ def build(expression: str, placement: str, leader: str = REPLICAS[0], applicatio
         raise unknown("placement", placement, PLACEMENTS)
     names = parse(expression)
     graph = _protected(names, placement, leader) if names else _bare(placement)
-    problems = graph.problems(KINDS)
-    assert not problems, problems
+    if problems := graph.problems(KINDS):
+        theirs = [name for name in names if name not in SHIPPED]
+        assert theirs, problems
+        raise registry.misfit(theirs[0], problems)
     return protecting(graph, application) if application else graph
 
 
@@ -150,7 +210,7 @@ def protecting(graph: Graph, application: str) -> Graph:
     """`graph` with another function in its Servers, and in the bricks that check replies by its assertion."""
 
     def brick(spec: BrickSpec) -> BrickSpec:
-        concerned = spec.part == "server" or spec.kind in REPLY_CHECKERS
+        concerned = spec.part == "server" or (spec.kind != ENGINE.name and BRICKS[spec.kind].checks_replies)
         return msgspec.structs.replace(spec, application=application) if concerned else spec
 
     return msgspec.structs.replace(graph, bricks=tuple(map(brick, graph.bricks)))

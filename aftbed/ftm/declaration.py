@@ -73,14 +73,14 @@ class Suitability(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     `deterministic`, `state_access`, `exact_state`: why the function must have it; empty: it need not.
     """
 
-    tolerates: tuple[FaultClass, ...] = ()
-    detects: tuple[FaultClass, ...] = ()
+    tolerates: tuple[FaultClass, ...] = ()  # faults that are not seen
+    detects: tuple[FaultClass, ...] = ()  # faults at which it stops its replica
     deterministic: str = ""
     state_access: str = ""
     exact_state: str = ""
-    cpus: Annotated[int, Meta(ge=1, le=1024)] = 1
-    cpu_load: Level = "low"
-    bandwidth: Level = "none"
+    cpus: Annotated[int, Meta(ge=1, le=1024)] = 1  # at least
+    cpu_load: Level = "low"  # what it takes
+    bandwidth: Level = "none"  # what it takes
 
 
 class Mechanism(msgspec.Struct, frozen=True, kw_only=True):

@@ -73,35 +73,35 @@ StepSeconds = Annotated[float, Meta(gt=0, le=STEP_S_MAX)]
 class RequestField(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A field of a request."""
 
-    type: Width
-    variable: str | None = None
-    time: Unit | None = None
-    step: Unit | None = None
-    skip: bool = False
+    type: Width  # how it is packed
+    variable: str | None = None  # of the FMU that it sets
+    time: Unit | None = None  # it is the time of the request, in this unit
+    step: Unit | None = None  # it is the length of the step, in this unit
+    skip: bool = False  # it means nothing to the FMU
 
 
 class ReplyField(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A field of a reply; `min` and `max` are allowed values."""
 
-    type: Width
-    variable: str
-    min: float | None = None
-    max: float | None = None
+    type: Width  # how it is packed
+    variable: str  # of the FMU that it is read from
+    min: float | None = None  # a lower value is not acceptable
+    max: float | None = None  # a higher value is not acceptable
 
 
 class DeclaredCharacteristics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """`state_access` None: as the FMU says."""
 
-    deterministic: bool = True
-    state_access: WrittenAccess | None = None
+    deterministic: bool = True  # the same requests give the same replies
+    state_access: WrittenAccess | None = None  # exact, none, {approximate: NUMBER}; left out: as the FMU says
 
 
 class PortsFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    reply: tuple[ReplyField, ...]
-    request: tuple[RequestField, ...] = ()
-    step_s: StepSeconds | None = None
+    reply: tuple[ReplyField, ...]  # its fields, in their order
+    request: tuple[RequestField, ...] = ()  # its fields, in their order
+    step_s: StepSeconds | None = None  # where no field has it
     start: dict[object, object] = {}  # a name may look like a number
-    characteristics: DeclaredCharacteristics = DeclaredCharacteristics()
+    characteristics: DeclaredCharacteristics = DeclaredCharacteristics()  # what the function declares
 
 
 # -- the model ------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ not exist is the user's error and costs the run nothing. What a fault does to th
 
 import re
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Final, get_args
 
 import msgspec
@@ -32,6 +32,7 @@ from aftbed.core.units import duration, milliseconds, number
 from aftbed.inject import grammar
 from aftbed.inject.grammar import NUMBER, ONCE, Chance, Every, Lasting, Permanent, Transient, Trigger, whole
 from aftbed.inject.kind import AnyFault, FaultKind, Injection, RunControl, Steps, receipt_of_car
+from aftbed.inject.next_words import next_words
 from aftbed.inject.receipts import Receipt
 from aftbed.vehicle.can.bus_model import NODES
 from aftbed.vehicle.condition import Condition
@@ -49,6 +50,7 @@ GRAMMAR: Final = (
     " each with [after 2s | when ttc < 1.2] [nth N] [for 500ms | intermittent p 0.1 | permanent],"
     " or babbling|bus-off NODE, partition NODE,...|NODE,... with [after 2s | when ttc < 1.2] [for 500ms]"
 )
+_Words = Callable[[], Iterable[str]]
 _NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}")
 _NODE: Final = re.compile(r"[a-z_][a-z0-9_]{0,31}")
 
@@ -266,6 +268,28 @@ class BusFault(FaultKind, frozen=True, tag="bus"):
     def read(cls, words: Sequence[str]) -> AnyFault:
         return AnyFault(read_bus_fault(" ".join(words)), BUS)
 
+    @classmethod
+    def next_words(cls, words: Sequence[str], graph: Graph) -> Iterable[str]:
+        """As `read_bus_fault` reads them. The messages are those of the car's own bus."""
+        verb, *rest = words
+        keys: tuple[str, ...] = ("after", "when", "for", grammar.PERMANENT)
+        if verb in ON_NODES:
+            sides = f"{NODES[0]}|{','.join(NODES[1:])}"
+            places: list[_Words] = [lambda: (sides,) if verb == Partition.VERB else NODES]
+        else:
+            places = [lambda: (BUS,), lambda: ("from", *_own_messages())]
+            places += [lambda: NODES] if rest[1:2] == ["from"] else []
+            places += _BEHIND_FRAMES.get(verb, ())
+            keys = (*keys, "nth", grammar.INTERMITTENT)
+        if len(rest) < len(places):
+            return places[len(rest)]()
+        behind = rest[len(places) :]
+        if verb != FlipBit.VERB or (behind and behind[0] != "crc"):
+            return next_words(behind, keys, graph)
+        if len(behind) == 1:
+            return ("good",)
+        return next_words(behind[2:], keys, graph) if behind else ("crc", *next_words([], keys, graph))
+
     @property
     def name(self) -> str:
         return self.effect.VERB
@@ -318,6 +342,19 @@ class BusFault(FaultKind, frozen=True, tag="bus"):
 
     def receipt(self, injection: Injection, run: RunControl) -> Receipt:
         return receipt_of_car(injection, run, self.opening.when)
+
+
+def _own_messages() -> list[str]:
+    from aftbed.vehicle.can.dbc_file import own_dbc  # noqa: PLC0415 - cantools, only where a shell asks
+
+    return own_dbc().names()
+
+
+_BEHIND_FRAMES: Final[dict[str, tuple[_Words, ...]]] = {  # by word, what it may be
+    Delay.VERB: (lambda: ("by",), lambda: ("20ms", "40ms")),
+    FlipBit.VERB: (lambda: ("bit",), lambda: ("21", "40")),
+    Masquerade.VERB: (lambda: ("as",), _own_messages),
+}
 
 
 # -- names ----------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ is kept except where it is the fault to break it, and nothing is held back for e
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from enum import Enum
 from typing import Final, NamedTuple, Self, assert_never
 
@@ -75,9 +75,18 @@ class ChannelFault(FaultKind, frozen=True, tag="disturb"):
         if fault.trigger.event:
             raise ValueError(f"a fault of a channel waits for no event: {fault.trigger.event}")
 
+    @classmethod
+    def subjects(cls, graph: Graph) -> list[str]:
+        return list(dict.fromkeys(link.name for link in graph.links))
+
+    @classmethod
+    def next_words(cls, words: Sequence[str], graph: Graph) -> Iterable[str]:
+        holding = Disturbance(words[0]) in HOLDING
+        return (word for word in super().next_words(words, graph) if holding or word != "by")
+
     def check(self, fault: AnyFault, graph: Graph) -> None:
         """The target has to send on the channel, in the roles that it can have."""
-        channels = {link.name for link in graph.links}
+        channels = self.subjects(graph)
         if self.channel not in channels:
             raise unknown("channel", self.channel, channels)
         if not 0 < self.by_ms <= DURATION_MS_MAX:

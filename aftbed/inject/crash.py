@@ -4,6 +4,7 @@ A node that emits the event and belongs to the target kills itself, so the point
 waits until the supervisor has seen the target dead.
 """
 
+from collections.abc import Iterable
 from typing import Self
 
 from aftbed.core.errors import ConfigError
@@ -19,6 +20,7 @@ class Crash(FaultKind, frozen=True, tag="crash"):
 
     NAMES = ("crash",)
     KEYS = ("for", *WHEN_KEYS)
+    REFUSED = ("for",)
 
     stops_process = True
     has_worst_instant = True
@@ -29,6 +31,10 @@ class Crash(FaultKind, frozen=True, tag="crash"):
         if "for" in words:
             raise ConfigError(f"'for {words['for']}': a crash has no duration; a hang and a slow have")
         return cls()
+
+    @classmethod
+    def subjects(cls, graph: Graph) -> Iterable[str]:
+        return (*super().subjects(graph), *targets.OTHERS)
 
     def subject(self, target: str) -> list[str]:
         return [target]

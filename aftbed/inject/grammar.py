@@ -46,6 +46,11 @@ _TIME: Final = re.compile(r"[0-9.]+(us|ms|s)")
 _WHOLE: Final = re.compile(r"[0-9]{1,12}")
 
 
+def count_of_values(key: str) -> int:
+    """How many words stand behind `key` as its value; behind `byte` there may be none."""
+    return 0 if key == PERMANENT else _VALUE_WORDS.get(key, 1)
+
+
 class FaultWords:
     """The words of one fault: name, subject, keys with their values.
 
@@ -62,8 +67,8 @@ class FaultWords:
                 raise unknown(f"word in fault {self.text!r}:", key, keys)
             if key in self._values:
                 raise ConfigError(f"fault {self.text!r}: {key!r} twice")
-            alone = key == PERMANENT or (key == BYTE and (not rest or rest[0].isalpha()))
-            count = 0 if alone else _VALUE_WORDS.get(key, 1)
+            alone = key == BYTE and (not rest or rest[0].isalpha())
+            count = 0 if alone else count_of_values(key)
             if len(rest) < count:
                 raise ConfigError(f"fault {self.text!r}: {key!r} lacks its value")
             if key == "at" and _TIME.fullmatch(rest[0]):

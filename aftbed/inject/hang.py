@@ -5,6 +5,7 @@ Without `for` the target stays stopped. The end of a stop is recorded in the run
 so the cleanup process thaws the target even if the supervisor has died (`runtime.unix.cleanup`).
 """
 
+from collections.abc import Iterable
 from typing import Final, Self
 
 from msgspec import structs
@@ -35,6 +36,10 @@ class Hang(FaultKind, frozen=True, tag="hang"):
     @classmethod
     def from_words(cls, words: FaultWords) -> Self:
         return cls(whole_milliseconds("duration", words["for"]) if "for" in words else FOREVER_MS)
+
+    @classmethod
+    def subjects(cls, graph: Graph) -> Iterable[str]:
+        return (*super().subjects(graph), *targets.OTHERS)
 
     def subject(self, target: str) -> list[str]:
         return [target, f"for {self.for_ms}ms" if self.for_ms else ""]

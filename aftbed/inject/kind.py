@@ -3,6 +3,7 @@
 A kind is one file and one line in `model.FaultAction`. The file has the rule of its words, what it may
 target, where it waits, what it does, what its receipt shows, and how it is undone:
 
+    being typed       next_words  what may stand next, for the completion of a shell
     words             from_words  `run --inject "..."`, `aftbed inject`, campaigns
     fault             check       before a run starts, and in it
     armed             waits_in    the brick that comes to its point; none: it strikes at once
@@ -26,6 +27,7 @@ from aftbed.core.journal import Record
 from aftbed.core.messages import Message
 from aftbed.inject import targets
 from aftbed.inject.grammar import ONCE, FaultWords, Persistence, Trigger, read_persistence, read_trigger
+from aftbed.inject.next_words import next_words
 from aftbed.inject.receipts import BusReport, RadarReport, Receipt, ReceiptState
 from aftbed.inject.shared_state import SharedState, StateHit
 from aftbed.inject.targets import TargetProcess
@@ -161,6 +163,7 @@ class FaultKind(msgspec.Struct, frozen=True):
 
     NAMES: ClassVar[tuple[str, ...]] = ()  # the first word of its rule
     KEYS: ClassVar[tuple[str, ...]] = ()  # of the words behind its subject
+    REFUSED: ClassVar[tuple[str, ...]] = ()  # of KEYS: read only to say why they make no sense here
 
     stops_process: ClassVar[bool] = False  # the fault model "crash": the process no longer serves
     alters_value: ClassVar[bool] = False  # the fault model "value"
@@ -200,6 +203,18 @@ class FaultKind(msgspec.Struct, frozen=True):
     def from_words(cls, words: FaultWords) -> Self:
         """The action in `words`. Raises ConfigError."""
         raise NotImplementedError
+
+    @classmethod
+    def subjects(cls, graph: Graph) -> Iterable[str]:
+        """What may stand behind its name in a run of `graph`."""
+        return (*targets.roles_in(graph), *graph.nodes)
+
+    @classmethod
+    def next_words(cls, words: Sequence[str], graph: Graph) -> Iterable[str]:
+        """What may stand behind `words`, its name or more of a fault of this kind."""
+        if len(words) == 1:
+            return cls.subjects(graph)
+        return next_words(words[2:], [key for key in cls.KEYS if key not in cls.REFUSED], graph)
 
     @property
     def nth_event(self) -> str:

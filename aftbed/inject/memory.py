@@ -9,7 +9,7 @@ is lost with the process. How the memory of another process is reached is in `ru
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final, Self
 
 from aftbed.core.errors import ConfigError, StepFailed
@@ -31,6 +31,7 @@ class MemoryFlip(FaultKind, frozen=True, tag="memory"):
 
     NAMES = (BITFLIP,)
     KEYS = BITFLIP_KEYS
+    REFUSED = tuple(key for key in (*PATTERN_KEYS, *REPEAT_KEYS) if key != "bit")
 
     alters_value = True
     strikes_stored_state = True
@@ -43,11 +44,21 @@ class MemoryFlip(FaultKind, frozen=True, tag="memory"):
 
     @classmethod
     def from_words(cls, words: FaultWords) -> Self:
-        other = words.first_of([key for key in (*PATTERN_KEYS, *REPEAT_KEYS) if key != "bit"])
+        other = words.first_of(cls.REFUSED)
         if other is not None:
             raise ConfigError(f"{other!r}: of memory one bit is flipped, once: 'bit 0' to 'bit 7' of a byte")
         bit = whole("bit", words["bit"], 0, BYTE_BITS - 1) if "bit" in words else None
         return cls(bit, _address(words["address"]) if "address" in words else None)
+
+    @classmethod
+    def subjects(cls, graph: Graph) -> tuple[str, ...]:
+        return (MEMORY,)
+
+    @classmethod
+    def next_words(cls, words: Sequence[str], graph: Graph) -> Iterable[str]:
+        if words[-1] == "in":
+            return (*targets.roles_in(graph), *graph.nodes)
+        return super().next_words(words, graph)
 
     def subject(self, target: str) -> list[str]:
         bit = "" if self.bit is None else f"bit {self.bit}"

@@ -13,6 +13,7 @@ from typing import Final, cast, get_args
 import msgspec
 
 from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.graph import Graph
 from aftbed.inject.bus import BUS, BusFault
 from aftbed.inject.channel import ChannelFault
 from aftbed.inject.crash import Crash
@@ -126,3 +127,15 @@ def read(words: Sequence[str]) -> Fault:
     if len(words) < 2:
         raise ConfigError(f"fault {' '.join(words)!r}: expected {GRAMMAR}")
     raise unknown("fault", words[0], NAMES, SYNONYMS)
+
+
+def next_words(words: Sequence[str], graph: Graph) -> list[str]:
+    """What may stand behind `words` of a fault in a run of `graph`; nothing where they are wrong."""
+    if not words:
+        return list(NAMES)
+    words = [SAME_ROLES.get(word, word) for word in words]
+    if len(words) > 1:
+        kinds = [kind for kind in KINDS if kind.claims(words)][:1]
+    else:
+        kinds = [kind for kind in KINDS if words[0] in kind.NAMES]
+    return list(dict.fromkeys(word for kind in kinds for word in kind.next_words(words, graph)))

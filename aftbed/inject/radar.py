@@ -23,7 +23,7 @@ asks (`vehicle.ecus.RadarDisturber`): so the same seed gives the same tracks in 
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from random import Random
 from typing import ClassVar, Final, Self, get_args
 
@@ -48,6 +48,7 @@ from aftbed.inject.grammar import (
     read_trigger,
 )
 from aftbed.inject.kind import AnyFault, FaultKind, Injection, RunControl, Steps, receipt_of_car
+from aftbed.inject.next_words import EXAMPLES, next_words
 from aftbed.inject.receipts import RadarReport, Receipt, ReceiptState
 from aftbed.vehicle.condition import Condition
 from aftbed.vehicle.radar import RANGE_MAX_M, SPEED_MAX_MS, Target
@@ -73,6 +74,7 @@ class Insufficiency(msgspec.Struct, frozen=True, tag=True):
 
     NAME: ClassVar[str] = ""
     KEYS: ClassVar[tuple[str, ...]] = ()
+    EXAMPLES: ClassVar[Mapping[str, Sequence[str]]] = EXAMPLES | {"by": ("-5", "2")}
 
     @classmethod
     def from_words(cls, words: FaultWords) -> Self:
@@ -166,6 +168,7 @@ class Latency(Insufficiency, frozen=True):
 
     NAME = "latency"
     KEYS = ("by",)
+    EXAMPLES = EXAMPLES
 
     @classmethod
     def from_words(cls, words: FaultWords) -> Self:
@@ -278,6 +281,17 @@ class RadarFault(FaultKind, frozen=True, tag="radar"):
                 _persistence(found),
             ),
             RADAR,
+        )
+
+    @classmethod
+    def next_words(cls, words: Sequence[str], graph: Graph) -> Iterable[str]:
+        if len(words) == 1:
+            return EFFECTS
+        effect = EFFECTS.get(words[1])
+        return (
+            ()
+            if effect is None
+            else next_words(words[2:], (*effect.KEYS, *WHEN_KEYS), graph, effect.EXAMPLES)
         )
 
     def subject(self, target: str) -> list[str]:

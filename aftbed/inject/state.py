@@ -36,6 +36,7 @@ class StateFlip(FaultKind, frozen=True, tag="state"):
 
     NAMES = (BITFLIP,)
     KEYS = BITFLIP_KEYS
+    REFUSED = ("address", *REPEAT_KEYS)
 
     alters_value = True
     strikes_stored_state = True
@@ -66,6 +67,13 @@ class StateFlip(FaultKind, frozen=True, tag="state"):
     @property
     def nth_event(self) -> str:
         return Event.SERVER_EXIT.label
+
+    @classmethod
+    def subjects(cls, graph: Graph) -> tuple[str, ...]:
+        """The fields of the built-in function; those of another one are known only in its node."""
+        if any(brick.application for brick in graph.bricks):
+            return ()
+        return tuple(f"{STATE}.{field.name}" for field in fields_of(AebFunction))
 
     def subject(self, target: str) -> list[str]:
         return [f"{STATE}.{self.field}", str(self.pattern), "in", target]

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple, Protocol
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.events import STEP_EVENTS, Event, event_named
 from aftbed.core.graph import STAGED, BrickSpec, Graph
-from aftbed.ftm.compose import EXPRESSIONS, build
+from aftbed.ftm.compose import build, expressions
 from aftbed.ftm.registry import EMITTERS, Emitter, server_emits
 
 PRIMARY, BACKUP = "primary", "backup"
@@ -19,9 +19,9 @@ OTHERS: Final = ("zygote", "zygote.bus", "hub", "vehicle", "player")
 SUPERVISOR: Final = "supervisor"  # emits the events of the steps of an adaptation
 ENGINE: Final = "engine"  # emits its other events
 ADAPTATION: Final = tuple(event for event in Event if event.label.startswith("adapt."))
-_EMITTERS: Final = EMITTERS | {
-    event: Emitter(ENGINE, of_backup=False) for event in ADAPTATION if event not in STEP_EVENTS
-}
+_OF_ENGINE: Final = dict.fromkeys(
+    (event for event in ADAPTATION if event not in STEP_EVENTS), Emitter(ENGINE, of_backup=False)
+)
 
 
 class TargetProcess(Protocol):
@@ -95,9 +95,10 @@ def check_process(target: str, event: str, graph: Graph) -> None:
     """Raise ConfigError unless `target` is a role, a node, or a process beside the graph, and `event` can
     happen.
     """
-    allowed = (*roles_in(graph), *_nodes(event, graph), *OTHERS)
-    if target not in allowed:
-        raise unknown("target", target, allowed)
+    if target not in (here := (*roles_in(graph), *graph.nodes, *OTHERS)):
+        allowed = (*here, *_nodes(event, graph))
+        if target not in allowed:
+            raise unknown("target", target, allowed)
     check_event(event, graph)
 
 
@@ -113,19 +114,24 @@ def check_event(event: str, graph: Graph) -> None:
     """Raise ConfigError unless `event`, if there is one, is emitted in `graph`."""
     if not event:
         return
-    label = event_named(event).label
-    roles = Roles(graph, "a", "b")
-    emitted = {e.label for e in (*EMITTERS, *ADAPTATION) if emitting_node(roles, e.label) is not None}
+    label, emitted = event_named(event).label, events_in(graph)
     if label not in emitted:
-        found = ", ".join(sorted(emitted))
+        found = ", ".join(emitted)
         raise ConfigError(f"event {label!r} cannot trigger a fault under --ftm {graph.ftm} (one of: {found})")
+
+
+def events_in(graph: Graph) -> list[str]:
+    """The labels of the events that are emitted in `graph`, sorted."""
+    roles = Roles(graph, "a", "b")
+    found = {e.label for e in (*EMITTERS, *ADAPTATION) if emitting_node(roles, e.label) is not None}
+    return sorted(found)
 
 
 def _nodes(event: str, graph: Graph) -> tuple[str, ...]:
     """The nodes that can be named: during an adaptation, those of any mechanism, and those being prepared."""
     if not event or event_named(event) not in ADAPTATION:
-        return tuple(graph.nodes)
-    others = (build(expression, graph.placement) for expression in EXPRESSIONS)
+        return ()
+    others = (build(expression, graph.placement) for expression in expressions())
     nodes = dict.fromkeys(node for one in (graph, *others) for node in one.nodes)
     return (*nodes, *(f"{node}{STAGED}" for node in nodes))
 
@@ -143,7 +149,7 @@ def emitting_node(roles: Roles, event: str) -> str | None:
 
 def emitting_brick(roles: Roles, event: str) -> str | None:
     """The brick that emits `event`; None where none does, or the supervisor."""
-    found = _EMITTERS.get(event_named(event))
+    found = _emitter_of(event_named(event))
     if found is None:
         return None
     part, of_backup = found
@@ -169,12 +175,20 @@ def emitting_brick_of(roles: Roles, event: str, replica: str) -> str | None:
 
 
 def emitting_part(event: Event) -> str:
-    return _EMITTERS[event][0]
+    emitter = _emitter_of(event)
+    assert emitter is not None, event
+    return emitter.part
+
+
+def _emitter_of(event: Event) -> Emitter | None:
+    return EMITTERS.get(event) or _OF_ENGINE.get(event)
 
 
 def emits(graph: Graph, event: Event, role: str) -> bool:
     """Whether a brick of the replica in `role` emits `event`."""
-    part, of_backup = _EMITTERS[event]
+    emitter = _emitter_of(event)
+    assert emitter is not None, event
+    part, of_backup = emitter
     if part == "server":
         return server_emits(graph, event, backs_up=role == BACKUP)
     return (role == BACKUP) is of_backup and any(_is(brick, part) for brick in graph.bricks)

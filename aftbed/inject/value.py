@@ -92,6 +92,7 @@ class ValueFlip(FaultKind, frozen=True, tag=BITFLIP):
 
     NAMES = (BITFLIP,)
     KEYS = BITFLIP_KEYS
+    REFUSED = ("address",)
 
     alters_value = True
     repeats = True
@@ -108,6 +109,10 @@ class ValueFlip(FaultKind, frozen=True, tag=BITFLIP):
     def nth_event(self) -> str:
         """The first at which the value is in hand."""
         return FLIPPED_AT[self.place][0].label
+
+    @classmethod
+    def subjects(cls, graph: Graph) -> tuple[str, ...]:
+        return PLACES
 
     def subject(self, target: str) -> list[str]:
         return [self.place.value, str(self.pattern), "in", target]

@@ -522,6 +522,22 @@ def strangers(record: RunRecord) -> list[Stranger]:
     ]
 
 
+def stranger_line(one: Stranger) -> str:
+    """What it did, for people."""
+    forged = f" (forged: {counted(one.forged)})" if one.forged else ""
+    figures = (
+        (one.connections, "on the bus"),
+        (one.turned_away, "turned away"),
+        (one.frames, f"frames{forged}"),
+        (one.refused, "elements refused"),
+        (one.commands_refused, "of them commands"),
+        (one.put_out_fast, "put out as too fast"),
+        (one.put_out_slow, "put out as too slow"),
+        (one.put_out_oversized, "put out for an element over the limit"),
+    )
+    return f"{one}: " + ", ".join(f"{count} {what}" for count, what in figures if count)
+
+
 def check_no_forged_frames(evidence: Evidence) -> Check | None:
     """G8: what a stranger sent in the name of a node of the run is a fault that was not asked for.
 

@@ -12,6 +12,7 @@ import msgspec
 
 from aftbed.core.application import Application, Characteristics
 from aftbed.core.errors import ConfigError
+from aftbed.core.installed import search_path
 from aftbed.functions.load import OWN_CODE, characteristics_of
 from aftbed.functions.source import told_of
 from aftbed.judge import execution
@@ -31,7 +32,7 @@ from aftbed.judge.execution import (
 from aftbed.judge.record import RunRecord
 from aftbed.judge.reference import changes_of, reference_run, requests_of, succession
 from aftbed.runtime.unix.confined import JobFailedError, ProcessLimits, ask
-from aftbed.runtime.unix.trust import NOBODY, Trust, VettedFiles, search_path, vetted
+from aftbed.runtime.unix.trust import NOBODY, Trust, VettedFiles, vetted
 
 OPAQUE_FILE_BYTES: Final = 1 << 30  # a model is unpacked; a program may keep a log
 LIMITS: Final = ProcessLimits(seconds=120.0, memory_bytes=4 << 30, file_bytes=0)

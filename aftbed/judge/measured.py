@@ -26,6 +26,7 @@ import msgspec
 
 from aftbed.core.application import EXACT, NONE, AccessKind, Characteristics, StateAccess
 from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.core.installed import search_path
 from aftbed.functions.source import told_of
 from aftbed.judge.exercise import (
     Answer,
@@ -46,7 +47,7 @@ from aftbed.judge.exercise import (
     of_reply,
 )
 from aftbed.runtime.unix.confined import JobFailedError, ProcessLimits, ask
-from aftbed.runtime.unix.trust import OWN_RUN, search_path, vetted
+from aftbed.runtime.unix.trust import OWN_RUN, vetted
 
 MODULE: Final = "aftbed.judge.exercise"
 START_SECONDS_MAX: Final = 20.0  # of a process and of what it loads

@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import BinaryIO, Final, TypeVar
 
 import msgspec
 
@@ -19,6 +19,7 @@ from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.input_file import open_input, read_input
 from aftbed.core.journal import Entry, EntryKind, History, Stored
 from aftbed.core.requirements import check_requirements
+from aftbed.ftm.compose import parse
 from aftbed.functions.request_file import ExpectedReplies
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
@@ -26,16 +27,17 @@ from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.deployment import Hosted
 from aftbed.runtime.unix.closed_loop import PolicyReport, Proposed, read_policy_report, read_proposals
 from aftbed.runtime.unix.journal_files import entries_dropped, stored_entries, stored_records
-from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions
+from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
 from aftbed.runtime.unix.request_store import stored_replies, stored_requests
 from aftbed.runtime.unix.run_directory import BUS_NAME, HISTORY_NAME
+from aftbed.vehicle.can.bus_load import BusLoad, bus_load
 from aftbed.vehicle.can.hub import LOG_BYTES_MAX, HubCounts
 from aftbed.vehicle.ecus import End
 from aftbed.vehicle.plant import VehicleResult
 
 DOCUMENT_BYTES_MAX: Final = 64_000_000  # of a file that is no journal
 IN_MEMORY_MAX: Final = 200_000  # records and entries that are kept, at some 200 bytes each
-PART_BYTES: Final = 1 << 20
+LINE_BYTES_MAX: Final = 256  # of the log of the bus; a longer line is read in parts
 END_KEYS: Final = (
     *("reason", "ended_ns", "seconds", "left", "unfinished", "lost", "leader", "backup", "hosted", "states"),
     *("epoch", "faults", "bus"),
@@ -128,6 +130,7 @@ class RunRecord(msgspec.Struct, frozen=True):
     excuses: Excuses | None = None
     kept: bool = False  # after the run, so it was sealed at its end
     frames: int = 0  # in the log of the bus
+    bus_load: BusLoad | None = None
     function_failures: tuple[str, ...] = ()  # of a simulated run: nodes that stopped for their function
     given: tuple[bytes, ...] | None = None
     expected: ExpectedReplies | None = None
@@ -167,6 +170,7 @@ def read_record(path: Path, *, in_memory: bool = False) -> RunRecord:
     what = f"{path / 'run.json'}: not the options of a run"
     options = _exactly(given | {"private": "", "listener": -1, "log": -1}, RunOptions, what)
     check_requirements(f"{path / 'run.json'}: verifies", options.verifies)
+    _check_mechanism(path / "run.json", options)
     try:
         started = msgspec.convert(about.get("started_ns"), int)
     except msgspec.ValidationError as error:
@@ -182,6 +186,7 @@ def read_record(path: Path, *, in_memory: bool = False) -> RunRecord:
         )
     )
     work = options.work
+    frames, load = _bus_log(path / BUS_NAME, work)
     return RunRecord(
         options,
         history,
@@ -194,21 +199,43 @@ def read_record(path: Path, *, in_memory: bool = False) -> RunRecord:
         path,
         started,
         kept=about.get("kept") is True,
-        frames=_frames(path / BUS_NAME),
+        frames=frames,
+        bus_load=load,
         given=stored_requests(path) if isinstance(work, LoadRun) and work.requests else None,
         expected=stored_replies(path) if isinstance(work, LoadRun) and work.expect else None,
     )
 
 
-def _frames(log: Path) -> int:
-    """How many lines it has; 0 where there is none."""
+def _check_mechanism(file: Path, options: RunOptions) -> None:
+    """Raise ConfigError if this installation cannot build the graph that ran, and say what it lacks."""
+    try:
+        parse(options.ftm)
+    except ConfigError as error:
+        packages = " and ".join(options.packages)
+        needed = f"; the run had it of {packages}: install that to judge it" if packages else ""
+        raise ConfigError(f"{file}: ftm: {error}{needed}") from None
+
+
+def _bus_log(log: Path, work: Work) -> tuple[int, BusLoad | None]:
+    """How many lines it has, and the load of the bus; 0 and None where there is none."""
+    counted = 0
+
+    def lines(file: BinaryIO) -> Iterator[bytes]:
+        nonlocal counted
+        for line in iter(partial(file.readline, LINE_BYTES_MAX), b""):
+            counted += line.endswith(b"\n")
+            yield line
+
+    if isinstance(work, LoadRun):
+        return 0, None
     try:
         with open_input(log) as file:
             if (size := os.fstat(file.fileno()).st_size) > LOG_BYTES_MAX:
                 raise ConfigError(f"{log}: {size} bytes, allowed are {LOG_BYTES_MAX}")
-            return sum(part.count(b"\n") for part in iter(partial(file.read, PART_BYTES), b""))
+            found = bus_load(lines(file), work.bitrate_bps)
+            return counted, found
     except FileNotFoundError:
-        return 0
+        return 0, None
     except OSError as error:
         raise ConfigError(f"{log}: {error.strerror}") from None
 

@@ -21,6 +21,7 @@ from aftbed.judge.sources import function_failures
 from aftbed.runtime.unix.closed_loop import PolicyReport, Proposed
 from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun
 from aftbed.runtime.unix.trust import NOBODY, Trust
+from aftbed.vehicle.can.bus_load import BusLoad
 from aftbed.vehicle.can.hub import Stranger
 from aftbed.vehicle.plant import VehicleResult
 
@@ -72,6 +73,7 @@ class Verdict(msgspec.Struct, frozen=True):
     checks: dict[str, str]
     reasons: list[str]
     strangers: list[Stranger]
+    bus_load: BusLoad | None  # None without a bus between processes
     app: str  # the function that the run began with, "" for the built-in one
     tolerance: float  # by which its replies may differ from those of the bare server
     function_failures: list[str]  # why nodes stopped whose function ended, or broke its contract
@@ -141,6 +143,7 @@ def judge(record: RunRecord, evidence: Evidence | None = None) -> Verdict:
         checks={name: check.finding for name, check in found.items()},
         reasons=[f"{name}: {reason}" for name, check in found.items() for reason in check.reasons],
         strangers=checks.strangers(record),
+        bus_load=record.bus_load,
         app=options.application,
         tolerance=evidence.reference.tolerance,
         function_failures=function_failures(record),

@@ -34,6 +34,8 @@ from aftbed.report.worst import by_badness, rerun, slowness_ms
 TEMPLATES: Final = Path(__file__).resolve().parent / "templates"
 DRAWN_MAX: Final = 3  # runs that are simulated again
 LISTED_MAX: Final = 20
+COLUMNS_MAX: Final = 4  # of a matrix of outcomes on a usual screen: with more it is turned
+FAULT, MECHANISM = "fault", "mechanism"  # what the rows of a matrix are
 PANELS_MAX: Final = 6  # plots of one kind of time
 METRICS: Final = {
     "recovery_ms": ("Recovery", "from the fault to the first good reply of the new master"),
@@ -115,6 +117,11 @@ def engine(*folders: Path) -> jinja2.Environment:
     return found
 
 
+def space_time_svg(diagram: SpaceTime) -> str:
+    """The diagram as a file of its own, as the pages have it."""
+    return page_text(engine(TEMPLATES).get_template("spacetime.svg.j2"), d=diagram)
+
+
 def page_text(page: jinja2.Template, **values: object) -> str:
     """The page without characters that no HTML may contain."""
     return _UNREADABLE.sub("�", page.render(**values))
@@ -183,29 +190,42 @@ def shares(stratum: StratumSummary) -> list[OutcomeShare]:
 
 
 class Matrix(msgspec.Struct, frozen=True):
-    """Strata by row and column."""
+    """Strata by row and column; in `corner`, what the rows are."""
 
-    faults: list[str]
+    corner: str
+    columns: list[str]
     rows: dict[str, dict[str, StratumSummary]]
+
+    def turned(self) -> "Matrix":
+        """Its columns as rows: a page can be as long as it wants, and no wider than its screen."""
+        rows = {
+            column: {name: cells[column] for name, cells in self.rows.items() if column in cells}
+            for column in self.columns
+        }
+        return Matrix(FAULT, list(self.rows), rows)
 
 
 def _matrices(strata: Iterable[StratumSummary], places: dict[str, tuple[str, str]]) -> list[Matrix]:
-    """One for all rows that share columns: rows with other faults are another table, not empty cells."""
+    """One for all rows that share columns: rows with other faults are another table, not empty cells.
+
+    Faults are columns, so that what a mechanism makes of each stands side by side; rows, where they are many.
+    """
     rows: dict[str, dict[str, StratumSummary]] = {}
     for stratum in strata:
         row, fault = places[stratum.name]
         rows.setdefault(row, {})[fault] = stratum
     found: list[Matrix] = []
     for name, cells in rows.items():
-        shared = [matrix for matrix in found if cells.keys() & set(matrix.faults)]
-        joined = Matrix([], {})
-        for matrix in (*shared, Matrix(list(cells), {name: cells})):
-            joined.faults.extend(fault for fault in matrix.faults if fault not in joined.faults)
+        shared = [matrix for matrix in found if cells.keys() & set(matrix.columns)]
+        joined = Matrix(MECHANISM, [], {})
+        for matrix in (*shared, Matrix(MECHANISM, list(cells), {name: cells})):
+            joined.columns.extend(fault for fault in matrix.columns if fault not in joined.columns)
             joined.rows.update(matrix.rows)
         at = found.index(shared[0]) if shared else len(found)
         found = [matrix for matrix in found if matrix not in shared]
         found.insert(at, joined)
-    return found
+    wide = [len(matrix.columns) > max(COLUMNS_MAX, len(matrix.rows)) for matrix in found]
+    return [matrix.turned() if turn else matrix for matrix, turn in zip(found, wide, strict=True)]
 
 
 # -- times ----------------------------------------------------------------------------------------

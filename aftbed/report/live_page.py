@@ -1,8 +1,12 @@
 """The live page of a run: what happens on the road, in the graph and on the bus, and the words that steer it.
 
-A process of its own serves it, at a low priority: it asks the run as `aftbed status` does, and reads the
-event log and the bus log as they grow. The run does not know of it, and a browser that does not read holds up
-nothing but its own connection. It ends with the run.
+A process of its own serves it, at a low priority: while there is a page, it asks the run for its status as
+`aftbed status` does, and reads the event log and the bus log as they grow. It asks for nodes and processes
+only where an event says that they may have changed, and each `LOOK_S`. The run does not know of it, and a
+browser that does not read holds up nothing but its own connection.
+
+It keeps one connection to the run, which ends with the run: then, and only then, the run has ended. A run
+that does not answer is stopped, or has no CPU; the pages are told for how long (`Snapshot.silent_s`).
 
 | request                    | answer                                                                    |
 |----------------------------|---------------------------------------------------------------------------|
@@ -17,8 +21,10 @@ was made to lead here) or from a page of another Origin.
 import contextlib
 import hmac
 import json
+import math
 import os
 import secrets
+import select
 import shlex
 import socket
 import subprocess
@@ -26,7 +32,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
@@ -36,21 +42,25 @@ from urllib.parse import parse_qs, urlsplit
 
 import msgspec
 
-from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.core.errors import AftbedError, ConfigError
 from aftbed.core.graph import Graph
-from aftbed.ftm.compose import EXPRESSIONS
+from aftbed.ftm.compose import expressions
 from aftbed.report.steering import ANSWER_CHARACTERS_MAX, COMMAND_S_MAX, child_command
-from aftbed.runtime.unix import control_client, linux
+from aftbed.runtime.unix import control_client, linux, run_directory
 from aftbed.runtime.unix.control_client import ProcessRow
 from aftbed.runtime.unix.run_directory import BUS_NAME, EVENT_LOG_NAME
+from aftbed.runtime.unix.transport import Line
+from aftbed.vehicle.can.bus_load import load_percent, logged_frame
 from aftbed.vehicle.can.hub import user_behind
 
 HOST: Final = "127.0.0.1"
 PERIOD_S: Final = 0.1  # between two snapshots
 IDLE_S: Final = 0.4  # between two looks whether the run lives, while there is no page
-START_S_MAX: Final = 10.0  # from the start of the run to its first answer
+LOOK_S: Final = 1.0  # between two looks at nodes and processes; for so long behind an event, each period
+SILENT_S: Final = 1.0  # without an answer until the pages are told, and between two times that they are
+LAST_COMMAND_S_MAX: Final = 0.5  # behind the end of the run, until the commands of pages have ended
 LAST_S_MAX: Final = 0.2  # that the pages may take to read the end
-END_S_MAX: Final = 0.8  # from the end of the run to that of the server
+END_S_MAX: Final = 0.9  # from the end of the run to that of the server
 CONNECTIONS_MAX: Final = 16
 COMMANDS_MAX: Final = 2  # at once
 COMMAND_BYTES_MAX: Final = 1000
@@ -69,14 +79,18 @@ class Snapshot(msgspec.Struct, frozen=True):
     """The run as it is now.
 
     `status` is that of `aftbed status --json`; `nodes` has the nodes of the graph with their bricks, dead
-    ones too, `processes` those that live. `events` are those since the last snapshot. `frames_s`: on the bus.
+    ones too, `processes` those that live. `events` are those since the last snapshot. `frames_s` and
+    `load_percent` (with stuffing at its worst, see `bus_load`) are of the bus, by its time; None without one.
+    `silent_s`: for how long the run has not answered; all else is then as before.
     """
 
     status: dict[str, object]
     nodes: dict[str, tuple[str, ...]]
     processes: list[ProcessRow]
-    frames_s: float
+    frames_s: float | None
+    load_percent: float | None
     events: list[dict[str, object]]
+    silent_s: float = 0.0
 
 
 decode_snapshot: Final = msgspec.json.Decoder(Snapshot).decode
@@ -100,11 +114,98 @@ class GrowingFile:
         return whole
 
 
+class BusMeter:
+    """What the log of the bus says since the last look, by its own time; None where there is no bus."""
+
+    def __init__(self, path: Path) -> None:
+        self._log = GrowingFile(path)
+        self._until_us = 0
+        self.frames_s: float | None = None
+        self.load_percent: float | None = None
+
+    def read(self, bitrate_bps: object) -> None:
+        if not isinstance(bitrate_bps, int):
+            return
+        frames = [found for line in self._log.lines() if (found := logged_frame(line + b"\n")) is not None]
+        since_us, self._until_us = self._until_us, frames[-1][0] if frames else self._until_us
+        seconds = (self._until_us - since_us) / 1e6
+        self.frames_s = round(len(frames) / seconds, 1) if seconds > 0 else 0.0
+        self.load_percent = round(load_percent(frames, since_us, self._until_us, bitrate_bps), 2)
+
+
+class RunEndedError(AftbedError):
+    """The run has ended."""
+
+
+class RunConnection:
+    """One connection to the run in `private`, which ends with it."""
+
+    def __init__(self, private: Path, silent: Callable[[float], None]) -> None:
+        self._private, self._silent = private, silent
+        self._line: Line[control_client.Answer] | None = None
+
+    def await_start(self) -> None:
+        """Return when the run can be asked."""
+        while True:
+            with contextlib.suppress(OSError):
+                self._line = self._connected()
+                return
+            time.sleep(PERIOD_S)
+
+    def close(self) -> None:
+        if self._line is not None:
+            self._line.close()
+
+    def check(self) -> None:
+        """Raise RunEndedError if it has ended."""
+        if self._line is not None and select.select([self._line], [], [], 0)[0]:  # no answer is owed: an end
+            self._give_up(self._line)
+        if self._line is None:
+            self._line = self._reconnected()
+
+    def ask(self, request: control_client.ControlRequest) -> dict[str, object]:
+        """Its answer, however long it takes; `silent` is called while there is none. Raises RunEndedError."""
+        asked_s = time.monotonic()
+        while True:
+            line = self._line = self._line or self._reconnected()
+            try:
+                line.send(request)
+                while not select.select([line], [], [], SILENT_S)[0]:
+                    self._silent(time.monotonic() - asked_s)
+                got = line.recv()
+            except OSError:
+                got = None
+            if got is not None:
+                answer = json.loads(got[0].data)
+                assert isinstance(answer, dict)
+                return answer
+            self._give_up(line)
+
+    def _reconnected(self) -> Line[control_client.Answer]:
+        """After an end that may have been one of the connection alone: there were too many."""
+        asked_s = time.monotonic()
+        while True:
+            try:
+                return self._connected()
+            except (FileNotFoundError, ConnectionRefusedError):
+                raise RunEndedError(self._private.name) from None
+            except OSError:  # the run is too busy to take it
+                self._silent(time.monotonic() - asked_s)
+
+    def _connected(self) -> Line[control_client.Answer]:
+        return Line(run_directory.connect(self._private), control_client.decode_answer)
+
+    def _give_up(self, line: Line[control_client.Answer]) -> None:
+        line.close()
+        self._line = None
+        time.sleep(PERIOD_S)
+
+
 class RunWatcher:
     """Looks at the run for all pages at once."""
 
     def __init__(self, private: Path) -> None:
-        self._private = private
+        self._run = RunConnection(private, self._tell_silence)
         self._changed = threading.Condition()
         self._now: Snapshot | None = None
         self._number = 0  # of the snapshot
@@ -113,51 +214,58 @@ class RunWatcher:
         self._pages = 0
         self._ended = False
 
-    def run(self) -> None:
-        """Look until the run has ended; seldom, and only whether it lives, while there is no page."""
+    def run(self, *, starting: bool) -> None:
+        """Look until the run has ended; seldom, and only whether it lives, while there is no page.
+
+        `starting`: it may not be there yet.
+        """
         try:
-            status = self._first_answer()
-            record = Path(str(status["record"]))
-            events, bus = GrowingFile(record / EVENT_LOG_NAME), GrowingFile(record / BUS_NAME)
-            counted_s = time.monotonic()
+            if starting:
+                self._run.await_start()
+            record = Path(str(self._run.ask(control_client.StatusQuery())["record"]))
+            events, bus = GrowingFile(record / EVENT_LOG_NAME), BusMeter(record / BUS_NAME)
+            nodes, processes = dict[str, tuple[str, ...]](), list[ProcessRow]()
+            looked_s = changed_s = -math.inf
             while True:
-                status = control_client.ask(self._private, control_client.StatusQuery())
                 if self._pages:
-                    frames, now_s = len(bus.lines()), time.monotonic()
-                    self._tell(self._look(status, frames / max(now_s - counted_s, PERIOD_S)), events.lines())
-                    counted_s = now_s
+                    status = self._run.ask(control_client.StatusQuery())
+                    lines, now_s = events.lines(), time.monotonic()
+                    if lines:
+                        changed_s = now_s
+                    if now_s - changed_s < LOOK_S or now_s - looked_s >= LOOK_S:
+                        nodes, processes = self._look()
+                        looked_s = now_s
+                    bus.read(status.get("bitrate_bps"))
+                    self._tell(Snapshot(status, nodes, processes, bus.frames_s, bus.load_percent, []), lines)
                 with self._changed:
                     if not self._pages:
                         self._changed.wait(IDLE_S)
                 time.sleep(PERIOD_S)
-        except (ConfigError, HarnessError, OSError):  # it has ended
+                self._run.check()
+        except RunEndedError:
             with self._changed:
                 self._ended = True
                 self._changed.notify_all()
+        finally:
+            self._run.close()
 
-    def _first_answer(self) -> dict[str, object]:
-        """The status, once the run is there. Raises HarnessError if it does not come."""
-        limit_s = time.monotonic() + START_S_MAX
-        while True:
-            try:
-                return control_client.ask(self._private, control_client.StatusQuery())
-            except ConfigError as error:
-                if time.monotonic() > limit_s:
-                    raise HarnessError(str(error)) from None
-                time.sleep(PERIOD_S)
+    def _look(self) -> tuple[dict[str, tuple[str, ...]], list[ProcessRow]]:
+        """The nodes of the graph, and the processes of those that live."""
+        graph = msgspec.convert(self._run.ask(control_client.GraphQuery()), Graph)
+        rows = control_client.process_rows(self._run.ask(control_client.ProcessesQuery()))
+        return graph.nodes, [row for row in rows if row.node]
 
-    def _look(self, status: dict[str, object], frames_s: float) -> Snapshot:
-        graph = msgspec.convert(control_client.ask(self._private, control_client.GraphQuery()), Graph)
-        rows = [row for row in control_client.processes(self._private) if row.node]
-        return Snapshot(status, graph.nodes, rows, round(frames_s, 1), [])
-
-    def _tell(self, snapshot: Snapshot, lines: list[bytes]) -> None:
+    def _tell(self, snapshot: Snapshot, lines: Sequence[bytes] = ()) -> None:
         with self._changed:
             self._events += map(json.loads, lines)
             self._events_seen += len(lines)
             self._now = snapshot
             self._number += 1
             self._changed.notify_all()
+
+    def _tell_silence(self, seconds: float) -> None:
+        if self._now is not None:
+            self._tell(msgspec.structs.replace(self._now, silent_s=round(seconds, 1)))
 
     def snapshots(self) -> Generator[Snapshot, None, None]:
         """For one page, from now on; the events that are kept come with the first."""
@@ -213,15 +321,14 @@ class PageServer(ThreadingHTTPServer):
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
 
-    def serve_until_the_end(self) -> None:
-        """Serve until the run has ended."""
+    def serve_until_the_end(self, *, starting: bool) -> None:
+        """Serve until the run has ended. `starting`: it may not be there yet."""
         serving = threading.Thread(target=self.serve_forever, args=(PERIOD_S,), daemon=True)
         serving.start()
-        self.watcher.run()
+        self.watcher.run(starting=starting)
         self.shutdown()
-        limit_s = time.monotonic() + LAST_S_MAX
-        for _ in range(CONNECTIONS_MAX):  # each page has been sent the end
-            self._room.acquire(timeout=max(0.0, limit_s - time.monotonic()))
+        _acquire_all(self.commands, COMMANDS_MAX, LAST_COMMAND_S_MAX)  # as the one that has stopped the run
+        _acquire_all(self._room, CONNECTIONS_MAX, LAST_S_MAX)  # each page has been sent the end
         self.server_close()
 
     def refusal(self, handler: "PageRequest") -> str:
@@ -242,6 +349,13 @@ class PageServer(ThreadingHTTPServer):
         return ""
 
 
+def _acquire_all(room: threading.Semaphore, count: int, seconds_max: float) -> None:
+    """Wait until nobody is in it."""
+    limit_s = time.monotonic() + seconds_max
+    for _ in range(count):
+        room.acquire(timeout=max(0.0, limit_s - time.monotonic()))
+
+
 class PageRequest(BaseHTTPRequestHandler):
     """One request of a browser."""
 
@@ -255,7 +369,7 @@ class PageRequest(BaseHTTPRequestHandler):
         elif place == "/":
             nonce = secrets.token_urlsafe(12)
             page = resources.files("aftbed.report").joinpath("templates/live.html").read_text("utf-8")
-            options = "".join(f"<option>{expression}</option>" for expression in EXPRESSIONS)
+            options = "".join(f"<option>{expression}</option>" for expression in expressions())
             page = page.replace("MECHANISMS", options).replace("NONCE", nonce)
             self._answer(HTTPStatus.OK, "text/html", page, nonce)
         elif place == "/stream":
@@ -367,12 +481,13 @@ def beside(listener: socket.socket, private: Path, token: str) -> Iterator[None]
         process.wait()
 
 
-def serve(listener: socket.socket, private: Path, token: str) -> None:
-    """Serve the page of the run in `private` until it has ended."""
+def serve(listener: socket.socket, private: Path, token: str, *, starting: bool = False) -> None:
+    """Serve the page of the run in `private` until it has ended. `starting`: it may not be there yet."""
     os.nice(NICE)
-    PageServer(listener, private, token).serve_until_the_end()
+    PageServer(listener, private, token).serve_until_the_end(starting=starting)
 
 
 if __name__ == "__main__":
     linux.die_with(int(sys.argv[1]))
-    serve(socket.socket(fileno=int(sys.argv[2])), Path(sys.argv[3]), os.environ.pop(TOKEN_VARIABLE, ""))
+    token_given = os.environ.pop(TOKEN_VARIABLE, "")
+    serve(socket.socket(fileno=int(sys.argv[2])), Path(sys.argv[3]), token_given, starting=True)

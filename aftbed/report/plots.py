@@ -1,7 +1,8 @@
 """Plots as SVG, drawn by matplotlib: distributions of times, sweeps, ranges, and the table of the road.
 
 `ecdf`, `curves` and `ranges` are pieces of a page: without a namespace, in the colours of the page's style
-sheet (so that a dark screen and paper get theirs), with a tooltip per line. `road_plot` is a file of its own.
+sheet (so that a dark screen and paper get theirs), with a tooltip per line. `road_plot` and `ftti_plot` are
+files of their own, in light colours; a style sheet in them has the dark ones, for browsers.
 The same data give the same bytes: there is no date, and ids are made from the title, which is therefore
 unique in a page. matplotlib is imported with the first plot, because that takes up to a second.
 
@@ -18,6 +19,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, Literal
 from xml.etree import ElementTree
 
@@ -51,6 +53,16 @@ COLOURS: Final = {  # of report.css
     BAD: "var(--bad)",
     GROUND: "var(--ground)",
 }
+DARK: Final = dict(  # of the same style sheet, in the order of COLOURS
+    zip(
+        COLOURS,
+        (
+            *("#56a8e0", "#ff9140", "#3fc9a0", "#e09ac6", "#e0c04a", "#9ad4f5", "#d0d0d0"),
+            *("#e4e7eb", "#9ba5b1", "#363d46", "#ff8a80", "#15181c"),
+        ),
+        strict=True,
+    )
+)
 FONT: Final = 'system-ui, "Segoe UI", Roboto, "DejaVu Sans", Arial, sans-serif'
 WIDTH, HEIGHT = 560.0, 250.0
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 14.0, 18.0, 40.0
@@ -58,7 +70,12 @@ LIMIT_PX: Final = 14.0  # from the name of a limit to that of the next
 CHARACTER_PX: Final = 6.3  # mean width of a character at 11 px
 RANGE_PX: Final = 46.0  # of a row of `ranges`
 RANGE_PX_MIN: Final = 6.0  # width of a bar; a narrower one gets caps
-GROUP_PX, ROAD_PX = 300.0, 620.0  # height of a picture of `road_plot`, and its width
+# Of files: the width of one or two panels, the height of a panel, of a group's name, of a line of the legend
+ROAD_PX, PANEL_PX, GROUP_PX, LEGEND_PX = 620.0, 240.0, 26.0, 18.0
+PANEL_LEFT, PANEL_RIGHT, PANEL_TOP, PANEL_BOTTOM = 56.0, 14.0, 24.0, 48.0
+COLUMNS_MAX: Final = 3
+BAND_STRIP: Final = 0.06  # width of a band, in widths of its axis
+RANGES_PX: Final = 1140.0  # the width of a page
 ROAD_TOP_KMH, ROAD_SPAN_KMH = 10.0, 1.0  # least height of the upright axis; least width of the level one
 DOTS_PER_INCH: Final = 72  # so that a point of matplotlib is a pixel of the SVG
 SVG: Final = "http://www.w3.org/2000/svg"
@@ -244,11 +261,11 @@ def over_time(
 
 
 def ranges(title: str, rows: Sequence[TimeRange]) -> str:
-    """A bar for each range of each row, the paper's above ours."""
+    """A bar for each range of each row, the paper's above ours; as wide as a page."""
     assert rows, "nothing to draw"
     height = TOP + RANGE_PX * len(rows) + BOTTOM
-    with _drawing(title, WIDTH, height) as drawing:
-        axes = drawing.axes(LEFT, TOP, WIDTH - RIGHT, height - BOTTOM)
+    with _drawing(title, RANGES_PX, height) as drawing:
+        axes = drawing.axes(RIGHT, TOP, RANGES_PX - RIGHT, height - BOTTOM)
         _scale(axes, "x", "ms", [end for row in rows for end in (*row.ours, *(row.theirs or ()))])
         axes.set_ylim(RANGE_PX * len(rows), 0)
         axes.set_yticks([])
@@ -263,63 +280,78 @@ def ranges(title: str, rows: Sequence[TimeRange]) -> str:
                 width_px = axes.transData.transform((high, 0))[0] - axes.transData.transform((low, 0))[0]
                 bar.set(solid_capstyle="butt" if width_px >= RANGE_PX_MIN else "projecting")
                 drawing.tip(bar, f"{row.name}: {side}: {words} ms", "range")
-        return drawing.svg()
+        return drawing.svg("plot broad")
 
 
-# -- the table of the road ----------------------------------------------------------------------------
+# -- files of their own: the table of the road, FTTI over speed ---------------------------------------
 
 
 def road_plot(title: str, curves: Sequence[RoadCurve]) -> str:
-    """The speed that is left at impact over the speed of the row, as a file of its own.
+    """The speed that is left at impact over the speed of the row.
 
-    One picture for each group, below each other, with a line for each mechanism and length of an outage. What
-    the table allows is a dotted line, and the closed form of an outage (an upper bound) a thin one. There is
-    at least one curve, and none is empty; a group of one row is drawn as points.
+    A panel for each curve, since many have the same values; those of a group stand side by side and share
+    their axes. A dot is a row. What the table allows is a line of steps, and the closed form of an outage (an
+    upper bound) a thin line. There is at least one curve, and none is empty.
     """
     assert curves and all(curve.points for curve in curves)
-    styles = {name: number for number, name in enumerate(dict.fromkeys(curve.name for curve in curves))}
-    groups = list(dict.fromkeys(curve.group for curve in curves))
-    legend_px = 40.0 + 18.0 * (len(styles) + 2)
-    with _drawing(title, ROAD_PX, legend_px + GROUP_PX * len(groups)) as drawing:
-        legend: dict[str, Line2D] = {}
-        for number, group in enumerate(groups):
-            top = legend_px + GROUP_PX * number
-            axes = drawing.axes(52, top + 34, ROAD_PX - 16, top + GROUP_PX - 44)
-            axes.set_title(group, loc="left", fontsize=11, fontweight="bold")
-            of_group = [curve for curve in curves if curve.group == group]
-            legend |= _road_picture(drawing, axes, of_group, styles)
+    groups = {curve.group: [one for one in curves if one.group == curve.group] for curve in curves}
+    columns = _columns([curve.name for curve in curves], max(map(len, groups.values())))
+    panel_rows = sum(math.ceil(len(of) / columns) for of in groups.values())
+    bounded = any(point.closed_kmh is not None for curve in curves for point in curve.points)
+    legend_px = 30.0 + LEGEND_PX * (3 if bounded else 2)
+    height = legend_px + GROUP_PX * len(groups) + PANEL_PX * panel_rows
+    with _drawing(title, _width(columns), height) as drawing:
+        legend: dict[str, Artist] = {}
+        top = legend_px
+        for group, of_group in groups.items():
+            drawing.heading(group, top + GROUP_PX - 6)
+            top += GROUP_PX
+            points = [point for curve in of_group for point in curve.points]
+            for number, curve in enumerate(of_group):
+                axes = drawing.panel(top + PANEL_PX * (number // columns), number % columns, columns)
+                axes.set_title(curve.name, loc="left", fontsize=11)
+                axes.set_xlim(*_spread([point.speed_kmh for point in points]))
+                highest = max(max(p.impact_kmh, p.limit_kmh, p.closed_kmh or 0.0) for p in points)
+                axes.set_ylim(0, max(ROAD_TOP_KMH, highest) * 1.08)
+                axes.set_xlabel("speed of the row, km/h")
+                if number % columns == 0:
+                    axes.set_ylabel("speed at impact, km/h")
+                legend |= _road_panel(drawing, axes, curve)
+            top += PANEL_PX * math.ceil(len(of_group) / columns)
         drawing.legend(title, legend)
         return drawing.svg(standalone=True)
 
 
-def _road_picture(
-    drawing: "_Drawing", axes: "Axes", curves: Sequence[RoadCurve], styles: Mapping[str, int]
-) -> "dict[str, Line2D]":
-    """One group. Returns an example of each kind of line, by name."""
-    points = [point for curve in curves for point in curve.points]
-    speeds = [point.speed_kmh for point in points]
-    spare = 5.0 if max(speeds) - min(speeds) < ROAD_SPAN_KMH else 0.0
-    highest = max(max(p.impact_kmh, p.limit_kmh, p.closed_kmh or 0.0) for p in points)
-    axes.set(xlim=(min(speeds) - spare, max(speeds) + spare), ylim=(0, max(ROAD_TOP_KMH, highest) * 1.08))
-    axes.set_xlabel("km/h of the row; upright: km/h at impact")
-    allowed = [(point.speed_kmh, point.limit_kmh) for point in curves[0].points]
-    found: dict[str, Line2D] = {}
-    for curve in curves:
-        bound = [(p.speed_kmh, p.closed_kmh) for p in curve.points if p.closed_kmh is not None]
-        if bound:
-            line = drawing.line(axes, bound, styles[curve.name])
-            line.set(linewidth=0.8, linestyle="solid")
-            found.setdefault("thin: at most, by v = sqrt(2 a (v0 t - d0))", line)
-        line = drawing.line(axes, [(p.speed_kmh, p.impact_kmh) for p in curve.points], styles[curve.name])
-        line.set(marker="o", markersize=5)
-        worst = max(point.impact_kmh for point in curve.points)
-        drawing.tip(line, f"{curve.name}: up to {worst:.1f} km/h", "line")
-        found[curve.name] = line
+def _road_panel(drawing: "_Drawing", axes: "Axes", curve: RoadCurve) -> "dict[str, Artist]":
+    """Draw one curve. Returns an example of each kind of line, by name."""
+    found: dict[str, Artist] = {}
+    allowed = _limit_steps([(point.speed_kmh, point.limit_kmh) for point in curve.points], axes.get_xlim())
     (line,) = axes.plot(*zip(*allowed, strict=True), color=BAD, linewidth=1.5, linestyle=DOTTED)
+    bound = [(point.speed_kmh, point.closed_kmh) for point in curve.points if point.closed_kmh is not None]
+    if bound:
+        (thin,) = axes.plot(*zip(*bound, strict=True), color=MUTED, linewidth=0.8)
+        found["at most, by v = sqrt(2 a (v0 t - d0))"] = thin
+    for point in curve.points:
+        dot = drawing.dot(axes, point.speed_kmh, point.impact_kmh, 0)
+        allows = f"allowed {point.limit_kmh:g} km/h" if point.limit_kmh else "allowed none"
+        words = f"{curve.name}: {point.speed_kmh:g} km/h: impact {point.impact_kmh:.1f} km/h, {allows}"
+        drawing.tip(dot, words, "point")
+        found["speed at impact of a row"] = dot
     return found | {"allowed by the table": line}
 
 
-# -- FTTI over speed --------------------------------------------------------------------------------
+def _limit_steps(points: Points, ends: tuple[float, float]) -> Points:
+    """A level line for each of `points` (by x), from half-way to its neighbours; outside to `ends`."""
+    edges = [(left[0] + right[0]) / 2 for left, right in pairwise(points)]
+    levels = zip([ends[0], *edges], [*edges, ends[1]], points, strict=True)
+    return [(x, y) for left, right, (_, y) in levels for x in (left, right)]
+
+
+def _spread(values: Sequence[float]) -> tuple[float, float]:
+    """The ends of an axis of rows: a little more than their values."""
+    low, high = min(values), max(values)
+    spare = 5.0 if high - low < ROAD_SPAN_KMH else 0.05 * (high - low)
+    return low - spare, high + spare
 
 
 class TimeBand(msgspec.Struct, frozen=True):
@@ -330,33 +362,79 @@ class TimeBand(msgspec.Struct, frozen=True):
     high_ms: float
 
 
-def ftti_plot(title: str, lines: Mapping[str, Points], bands: Sequence[TimeBand]) -> str:
-    """A line for each of `lines`, points (km/h, ms), and the bands below them, as a file of its own.
+class FttiCurve(msgspec.Struct, frozen=True):
+    """The FTTI of one fault and its closed form, both points (km/h, ms). The form may have none."""
 
-    There is a line, and none is empty. Where a band reaches a line, the hazard comes before the handling.
+    fault: str
+    points: Points
+    closed: Points = ()
+
+
+def ftti_plot(title: str, curves: Sequence[FttiCurve], bands: Sequence[TimeBand]) -> str:
+    """A panel for each curve, with the bands beside its points.
+
+    There is a curve, and none is empty. Where the end of a band reaches a point, the hazard comes before the
+    handling.
     """
-    assert lines and all(lines.values()), "nothing to draw"
-    legend_px = 40.0 + 18.0 * (len(lines) + len(bands))
-    with _drawing(title, ROAD_PX, legend_px + GROUP_PX) as drawing:
-        axes = drawing.axes(52, legend_px + 34, ROAD_PX - 16, legend_px + GROUP_PX - 44)
-        speeds = [speed for points in lines.values() for speed, _ in points]
-        ends = [end for band in bands for end in (band.low_ms, band.high_ms) if end > 0.0]
-        _scale(axes, "y", "ms", [*(ms for points in lines.values() for _, ms in points), *ends])
-        spare = 5.0 if max(speeds) - min(speeds) < ROAD_SPAN_KMH else 1.0
-        axes.set_xlim(min(speeds) - spare, max(speeds) + spare)
-        axes.set_xlabel("km/h")
+    assert curves and all(curve.points for curve in curves), "nothing to draw"
+    columns = _columns([curve.fault for curve in curves], len(curves))
+    closed = any(curve.closed for curve in curves)
+    legend_px = 30.0 + LEGEND_PX * (1 + closed + len(bands))
+    height = legend_px + PANEL_PX * math.ceil(len(curves) / columns)
+    with _drawing(title, _width(columns), height) as drawing:
         legend: dict[str, Artist] = {}
-        for number, (name, points) in enumerate(lines.items()):
-            line = drawing.line(axes, points, number)
-            line.set(marker="o", markersize=5)
-            drawing.tip(line, f"{name}: {milliseconds(min(ms for _, ms in points))} ms at least", "line")
-            legend[name] = line
-        for number, band in enumerate(bands, len(lines)):
-            low, high = max(band.low_ms, axes.get_ylim()[0]), max(band.high_ms, axes.get_ylim()[0])
-            colour = LINES[number % len(LINES)][0]
-            legend[f"FHTI of {band.name}"] = axes.axhspan(low, high, color=colour, alpha=0.3)
+        every = [point for curve in curves for point in (*curve.points, *curve.closed)]
+        ends = [end for band in bands for end in (band.low_ms, band.high_ms) if end > 0.0]
+        for number, curve in enumerate(curves):
+            axes = drawing.panel(legend_px + PANEL_PX * (number // columns), number % columns, columns)
+            logarithmic = _scale(axes, "y", "", [*(ms for _, ms in every), *ends])
+            axes.set_title(curve.fault, loc="left", fontsize=11, color=INK)
+            low, high = _spread([speed for speed, _ in every])
+            strip = BAND_STRIP * (high - low) * len(bands)  # the bands have a place of their own
+            axes.set(xlim=(low, high + strip), xlabel="speed, km/h")
+            if number % columns == 0:
+                axes.set_ylabel("time, ms, logarithmic" if logarithmic else "time, ms")
+            legend |= _ftti_panel(drawing, axes, curve)
+            for place, band in enumerate(bands):
+                at = high + strip * (place + 0.5) / len(bands)
+                legend[f"FHTI of {band.name}"] = _band(drawing, axes, band, at, 1 + place)
         drawing.legend(title, legend)
         return drawing.svg(standalone=True)
+
+
+def _ftti_panel(drawing: "_Drawing", axes: "Axes", curve: FttiCurve) -> "dict[str, Artist]":
+    """Draw one curve. Returns an example of each kind of line, by name."""
+    line = drawing.line(axes, curve.points, 0)
+    line.set(marker="o", markersize=6)
+    drawing.tip(line, f"{curve.fault}: {milliseconds(min(ms for _, ms in curve.points))} ms at least", "line")
+    if not curve.closed:
+        return {"FTTI": line}
+    (rings,) = axes.plot(*zip(*curve.closed, strict=True), "o", markersize=11, color=MUTED)
+    rings.set(markerfacecolor="none", markeredgewidth=1)
+    return {"FTTI": line, "closed form": rings}
+
+
+def _band(drawing: "_Drawing", axes: "Axes", band: TimeBand, at: float, number: int) -> "Line2D":
+    """A bar at `at`, and a dotted line over the whole width where it ends."""
+    floor = axes.get_ylim()[0]
+    low, high = max(band.low_ms, floor), max(band.high_ms, floor)
+    colour = LINES[number % len(LINES)][0]
+    axes.axhline(high, color=colour, linewidth=1, linestyle=DOTTED)
+    (bar,) = axes.plot((at, at), (low, high), color=colour, linewidth=8)
+    bar.set_solid_capstyle("butt")
+    words = " to ".join(dict.fromkeys(map(milliseconds, (band.low_ms, band.high_ms))))
+    drawing.tip(bar, f"FHTI of {band.name}: {words} ms", "range")
+    return bar
+
+
+def _columns(names: Sequence[str], panels: int) -> int:
+    """How many panels stand side by side: as many as there are, and as their names leave room for."""
+    longest_px = CHARACTER_PX * max(map(len, names)) + PANEL_LEFT
+    return max(1, min(panels, COLUMNS_MAX, int(_width(COLUMNS_MAX) / longest_px)))
+
+
+def _width(columns: int) -> float:
+    return ROAD_PX if columns == 1 else ROAD_PX * columns / 2
 
 
 # -- matplotlib -----------------------------------------------------------------------------------
@@ -364,8 +442,8 @@ def ftti_plot(title: str, lines: Mapping[str, Points], bands: Sequence[TimeBand]
 
 def _scale(
     axes: "Axes", which: Literal["x", "y"], name: str, values: Iterable[float], form: Format = milliseconds
-) -> None:
-    """Round ticks, on an axis that is logarithmic if the values differ by more than LOG_FROM."""
+) -> bool:
+    """Round ticks, on an axis that is logarithmic if the values differ by more than LOG_FROM: returned."""
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator  # noqa: PLC0415
 
     ordered = sorted(values)
@@ -387,6 +465,7 @@ def _scale(
         axes.set_xlabel(words)
     else:
         axes.set_title(words, loc="left", fontsize=11, color=MUTED)
+    return logarithmic
 
 
 @contextmanager
@@ -413,6 +492,16 @@ class _Drawing:
         """Axes whose frame has these edges, in pixels from the upper left corner."""
         width, height = (right - left) / self.width, (bottom - top) / self.height
         return self._figure.add_axes((left / self.width, 1 - bottom / self.height, width, height))
+
+    def panel(self, top: float, column: int, columns: int) -> "Axes":
+        """Axes in one of `columns` columns, with room for a name above and for labels."""
+        left, each = self.width * column / columns, self.width / columns
+        return self.axes(
+            left + PANEL_LEFT, top + PANEL_TOP, left + each - PANEL_RIGHT, top + PANEL_PX - PANEL_BOTTOM
+        )
+
+    def heading(self, words: str, baseline: float) -> None:
+        self._figure.text(PANEL_LEFT / self.width, 1 - baseline / self.height, words, weight="bold")
 
     def line(self, axes: "Axes", points: Points, number: int) -> "Line2D":
         """In the style with that number."""
@@ -441,7 +530,7 @@ class _Drawing:
         handles, names = list(lines.values()), list(lines)
         self._figure.legend(handles, names, loc="upper left", bbox_to_anchor=box, frameon=False)
 
-    def svg(self, *, standalone: bool = False) -> str:
+    def svg(self, css: str = "plot", *, standalone: bool = False) -> str:
         """For a page without namespace and with its colours, or as a file."""
         for artist in self._figure.findobj():
             artist.set_clip_on(False)  # all lies within the axes; a clip path would be one more id
@@ -456,9 +545,11 @@ class _Drawing:
         for element in list(root.iter()):
             self._tidy(element, used, COLOURS if not standalone else {})
         about = {"width": f"{self.width:g}", "height": f"{self.height:g}", "stroke-linejoin": "round"}
-        root.attrib |= about | {"class": "plot", "role": "img", "aria-label": self.title}
+        root.attrib |= about | {"class": css, "role": "img", "aria-label": self.title}
         root.attrib |= {"xmlns": SVG} if standalone else {}
         del root.attrib["version"]
+        if standalone:
+            root.insert(0, _dark_style())
         return ElementTree.tostring(root, encoding="unicode") + ("\n" if standalone else "")
 
     def _tidy(self, element: ElementTree.Element, used: set[str], colours: Mapping[str, str]) -> None:
@@ -481,3 +572,15 @@ class _Drawing:
         if style := element.get("style"):
             style = _FONT.sub(FONT, style)
             element.set("style", _COLOUR.sub(lambda found: colours.get(found[0], found[0]), style))
+
+
+def _dark_style() -> ElementTree.Element:
+    """For a browser on a dark screen; other programs leave it and show the light colours."""
+    rules = (
+        f'[style*="{what}: {light}"]{{{what}:{dark} !important}}'
+        for light, dark in DARK.items()
+        for what in ("fill", "stroke")
+    )
+    style = ElementTree.Element("style")
+    style.text = f"@media (prefers-color-scheme: dark){{{''.join(rules)}}}"
+    return style

@@ -12,7 +12,7 @@ import msgspec
 from markupsafe import Markup
 
 from aftbed.core.events import Event
-from aftbed.judge.checks import counted
+from aftbed.judge.checks import stranger_line
 from aftbed.judge.record import RunRecord
 from aftbed.judge.timeline import TimeAxis, logged_events, node_journals, sent_requests
 from aftbed.judge.verdict import CHECKERS, Verdict
@@ -53,9 +53,8 @@ def run_page(record: RunRecord, verdict: Verdict) -> str:
         drive=drive,
         drawings=[(title, Markup(svg)) for title, svg in _drawings(drive, _marks(record))],
         diagram=space_time_of(record),
-        strangers=[(str(one), one) for one in verdict.strangers],
+        strangers=list(map(stranger_line, verdict.strangers)),
         lines=[((one.t_ns - record.started_ns) / 1e6, one.event, one.text) for one in logged_events(record)],
-        counted=counted,
     )
 
 

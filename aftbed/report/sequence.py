@@ -4,10 +4,11 @@ All three are made from one trace (`runtime.sim.trace`), in the words of `judge.
 every request leaves are the usual case; a *turning point* is a fault, an alarm, a step of a failover, the
 start or the end of an adaptation.
 
-- `listing` and `mermaid` show the last `LAST` entries before a promise was broken. A breach has no time of
-  its own, because the checks read a whole history. If its reason names a request, the entries end with the
-  last one of that request, otherwise with the end of the run. Mermaid leaves out the usual records: the
-  arrows show as much.
+- `listing` shows the last `LAST` entries before a promise was broken. A breach has no time of its own,
+  because the checks read a whole history. If its reason names a request, the entries end with the last one of
+  that request, otherwise with the end of the run.
+- `mermaid` shows the entries that `space_time` shows, and of a broken run also the last `LAST`. It leaves out
+  the usual records: the arrows show as much.
 - `space_time` lays out a diagram in Lamport's form ("Time, clocks, and the ordering of events", CACM 21,
   1978): a row per node, time from left to right, an arrow per message. It shows the turning points, with
   `BEFORE` entries before and `AFTER` entries after each. What is left out is a gap, with its number of
@@ -43,9 +44,9 @@ from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.trace import STRUCK, Happening, LoggedLine, Sent, Trace, brief, digest, milliseconds
 
 EXECUTIVE: Final = "supervisor"
-LAST: Final = 40  # lines of a listing; arrows and notes of a Mermaid diagram
-BEFORE, AFTER = 14, 30  # entries around a turning point in a space-time diagram
-KEPT_MAX: Final = 330  # entries of a space-time diagram
+LAST: Final = 40  # lines of a listing; entries before a breach in a Mermaid diagram
+BEFORE, AFTER = 14, 30  # entries around a turning point in a diagram
+KEPT_MAX: Final = 330  # entries of a diagram
 
 BACK: Final = frozenset(
     {"aft2pro", "pro2pxy", "pxy2clt", "srv2prd", "srv2aft", "srv2bfr"}
@@ -173,7 +174,34 @@ def _ms(t_ns: int) -> str:
     return f"{milliseconds(t_ns):.3f}"
 
 
-# -- the end of a run: listing and Mermaid --------------------------------------------------------
+# -- which entries are shown ----------------------------------------------------------------------
+
+
+class _Kept(NamedTuple):
+    """An entry of a diagram, the number of entries left out before it, and the time since the one before."""
+
+    one: _Shown
+    skipped: int
+    waited_ns: int
+
+
+def _kept(happened: Sequence[_Shown], ending: int = 0) -> list[_Kept]:
+    """The turning points, what is around them, and the last `ending` entries; the end if there are none."""
+    kept = set(range(max(0, len(happened) - ending), len(happened)))
+    for turn in [at for at, one in enumerate(happened) if is_turn(one)] or [len(happened) - 1]:
+        around = range(max(0, turn - BEFORE), min(len(happened), turn + AFTER + 1))
+        if len(kept.union(around)) > KEPT_MAX:
+            break
+        kept.update(around)
+    found, before = list[_Kept](), min(kept, default=0) - 1
+    for at in sorted(kept):
+        waited_ns = happened[at].t_ns - happened[max(before, 0)].t_ns
+        found.append(_Kept(happened[at], at - before - 1, waited_ns))
+        before = at
+    return found
+
+
+# -- listing and Mermaid --------------------------------------------------------------------------
 
 
 def listing(trace: Trace, broken: Sequence[Breach] = (), last: int = LAST) -> str:
@@ -203,18 +231,22 @@ def _until(happened: Sequence[Happening], broken: Sequence[Breach]) -> Sequence[
     return happened
 
 
-def mermaid(trace: Trace, broken: Sequence[Breach] = (), last: int = LAST) -> str:
-    """The same in Mermaid: nodes are participants, faults and lines of the executive are notes."""
+def mermaid(trace: Trace, broken: Sequence[Breach] = ()) -> str:
+    """In Mermaid: nodes are participants; faults, lines of the executive and what is left out are notes."""
     views = _Views.of(trace)
-    shown = [(one.t_ns, view) for one in _until(trace.happened, broken) if (view := views(one)).note][-last:]
-    names = dict.fromkeys(name for _, view in shown for name in view.nodes if name != EXECUTIVE)
+    kept = _kept(_until(trace.happened, broken), LAST if broken else 0)
+    shown = [(one, view) for one in kept if (view := views(one.one)).note or one.skipped]
+    names = dict.fromkeys(name for _, view in shown if view.note for name in view.nodes if name != EXECUTIVE)
     aliases = {name: f"p{number}" for number, name in enumerate(names or (EXECUTIVE,))}
     all_nodes = ",".join(dict.fromkeys((next(iter(aliases.values())), list(aliases.values())[-1])))
     found = [f"participant {alias} as {escaped(name)}" for name, alias in aliases.items()]
-    for t_ns, view in shown:
-        where = "->>".join(aliases.get(name, all_nodes) for name in view.nodes)
-        where = where if view.shape == "arrows" else f"Note over {where}"
-        found.append(f"{where}: {escaped(f'{_ms(t_ns)} ms: {view.note}')}")
+    for (one, skipped, waited_ns), view in shown:
+        if skipped:
+            found.append(f"Note over {all_nodes}: {escaped(f'{skipped} more, {waited_ns / 1e6:.3g} ms')}")
+        if view.note:
+            where = "->>".join(aliases.get(name, all_nodes) for name in view.nodes)
+            where = where if view.shape == "arrows" else f"Note over {where}"
+            found.append(f"{where}: {escaped(f'{_ms(one.t_ns)} ms: {view.note}')}")
     found += [f"Note over {all_nodes}: {escaped(f'broken: {breach}')}" for breach in broken]
     return "".join(f"{line}\n" for line in ("sequenceDiagram", *(f"    {line}" for line in found)))
 
@@ -316,20 +348,12 @@ def _since(one: Record | Passed | LoggedLine, started_ns: int) -> Record | Passe
 
 
 def _space_time(happened: Sequence[_Shown], views: _Views) -> SpaceTime:
-    kept: set[int] = set()
-    for turn in [at for at, one in enumerate(happened) if is_turn(one)] or [len(happened) - 1]:
-        around = range(max(0, turn - BEFORE), min(len(happened), turn + AFTER + 1))
-        if len(kept.union(around)) > KEPT_MAX:
-            break
-        kept.update(around)
-    places, x, before = list[_Place](), LEFT_PX, min(kept, default=0) - 1
-    for at in sorted(kept):
-        one, skipped = happened[at], at - before - 1
-        waited_ns, view = one.t_ns - happened[max(before, 0)].t_ns, views(one)
+    places, x = list[_Place](), LEFT_PX
+    for one, skipped, waited_ns in _kept(happened):
+        view = views(one)
         x += GAP_PX if skipped else WAIT_PX * math.log10(max(1.0, waited_ns / WAIT_NS))
         places.append(_Place(x, one, view, skipped, waited_ns))
         x += view.room_px
-        before = at
     parts = (node.rpartition("/")[2] for one in happened for node in views.nodes(one))
     text = _lines(views, [place.one for place in places])
     return _layout(places, {part: at for at, part in enumerate(dict.fromkeys(parts))}, text)

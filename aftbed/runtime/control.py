@@ -61,7 +61,12 @@ class ControlOrder(msgspec.Struct, frozen=True, tag=True):
 
 
 class Park(ControlOrder, frozen=True):
-    """To a zygote: fork one spare for each descriptor that came along."""
+    """To a zygote: fork one spare for each descriptor that came along.
+
+    `mechanisms`: those of installed packages, which it imports before.
+    """
+
+    mechanisms: tuple[str, ...] = ()
 
 
 class JoinRun(ControlOrder, frozen=True):

@@ -19,14 +19,13 @@ from typing import Final, NamedTuple
 import msgspec
 
 from aftbed.adapt.planner import plan, target
-from aftbed.adapt.policy import ADAPTABLE
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.events import Event
 from aftbed.core.graph import STAGED
 from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import Stage, flat
-from aftbed.ftm.compose import DUPLEX_EXPRESSIONS, build, parse, tolerates
+from aftbed.ftm.compose import NONE, build, duplex_expressions, expressions, parse, tolerates
 from aftbed.ftm.registry import MECHANISMS, server_emits
 from aftbed.functions.load import NO_CODE, OWN_CODE, Code
 from aftbed.functions.request_file import GivenRequests
@@ -44,9 +43,6 @@ from aftbed.runtime.sim.world import Doom, Run, Setup, World, simulate
 from aftbed.runtime.unix.worker_pool import SECONDS_MAX, Alone, each, own_seconds_max
 from aftbed.search.tally import Happened, happened_in
 
-ADAPTED: Final = tuple(  # unless others are named
-    ftm for ftm in ADAPTABLE if all(MECHANISMS[name].adaptations_explored for name in parse(ftm))
-)
 PLACEMENTS: Final = ("process", "replica")
 STEPS: Final = (Event.ADAPT_STEP_ENTER, Event.ADAPT_STEP_ACT, Event.ADAPT_STEP_EXIT)
 ELSEWHERE: Final = ("client", "a/watchdog", "b/watchdog")  # take no part in an adaptation
@@ -178,8 +174,8 @@ class Explorer(NamedTuple):
     experiments of a selection, always in the same order.
     """
 
-    known: tuple[str, ...]
-    ftms: tuple[str, ...]
+    known: Callable[[], tuple[str, ...]]
+    ftms: Callable[[], tuple[str, ...]]
     every: Callable[["Selection"], Iterator[Setup]]
 
 
@@ -207,21 +203,33 @@ class Selection(msgspec.Struct, frozen=True):
         return Setup(count=self.requests, application=self.application, given=self.given)
 
 
+def adaptable() -> tuple[str, ...]:
+    """What an adaptation may lead to: nothing leads to `none`, or away from it."""
+    return tuple(ftm for ftm in expressions() if ftm != NONE)
+
+
+def adapted() -> tuple[str, ...]:
+    """Those of them that are explored unless others are named."""
+    return tuple(
+        ftm for ftm in adaptable() if all(MECHANISMS[name].adaptations_explored for name in parse(ftm))
+    )
+
+
 EXPLORERS: Final = {
     "crash": Explorer(
-        DUPLEX_EXPRESSIONS, DUPLEX_EXPRESSIONS, lambda s: crashes(s.base, s.ftms, s.placements)
+        duplex_expressions, duplex_expressions, lambda s: crashes(s.base, s.ftms, s.placements)
     ),
     "adapt": Explorer(
-        ADAPTABLE, ADAPTED, lambda s: adaptations(itertools.permutations(s.ftms, 2), s.placements)
+        adaptable, adapted, lambda s: adaptations(itertools.permutations(s.ftms, 2), s.placements)
     ),
-    "pairs": Explorer(DUPLEX_EXPRESSIONS, DUPLEX_EXPRESSIONS, lambda s: pairs(s.ftms, s.placements)),
+    "pairs": Explorer(duplex_expressions, duplex_expressions, lambda s: pairs(s.ftms, s.placements)),
 }
 
 
 def selected(explorer: str, ftms: Iterable[str], placements: Iterable[str], requests: int = 0) -> Selection:
     """What is named; where nothing is, all that is explored. Raises ConfigError naming what cannot be."""
     found = EXPLORERS[explorer]
-    ftms = _chosen("FTM", ftms, found.known) or found.ftms
+    ftms = _chosen("FTM", ftms, found.known()) or found.ftms()
     chosen = Selection(explorer, ftms, _chosen("placement", placements, PLACEMENTS) or PLACEMENTS)
     if explorer == "adapt" and len(chosen.ftms) < 2:
         raise ConfigError(f"--ftm {chosen.ftms[0]}: an adaptation leads to another one: name two")

@@ -5,11 +5,12 @@ from typing import Final
 
 from hypothesis import strategies as st
 
-from aftbed.adapt.policy import ADAPTABLE, NS_PER_S, Action, Beyond, Policy, PolicyFile, policy_from
+from aftbed.adapt.policy import NS_PER_S, Action, Beyond, Policy, PolicyFile, policy_from
 from aftbed.core.yaml_file import read_yaml
-from aftbed.ftm.compose import DUPLEX, SIMPLEX
+from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, SIMPLEX
 
 S: Final = NS_PER_S
+ADAPTABLE: Final = EXPRESSIONS[1:]  # all but `none`
 COMPOSE, DECOMPOSE = Action("compose", "tr"), Action("decompose")
 TO_LFR, TO_PBR = Action("switch", "lfr"), Action("switch", "pbr")
 ACTIONS: Final = (

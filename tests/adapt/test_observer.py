@@ -7,10 +7,9 @@ from typing import Final
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from policies import ACTIONS, COMPOSE, DECOMPOSE, TO_LFR, S, beyond_oracle, beyonds, levels
+from policies import ACTIONS, ADAPTABLE, COMPOSE, DECOMPOSE, TO_LFR, S, beyond_oracle, beyonds, levels
 
 from aftbed.adapt.policy import (
-    ADAPTABLE,
     Action,
     Beyond,
     Burst,

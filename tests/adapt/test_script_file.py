@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from plans import CASES, Case
 
 from aftbed.adapt.script_check import refusals
-from aftbed.adapt.script_file import PORTS, RECOVERY, VERBS, ScriptFile, mapping, refuse, script_from
+from aftbed.adapt.script_file import RECOVERY, VERBS, ScriptFile, mapping, port_names, refuse, script_from
 from aftbed.cli.adapt import yaml_lines
 from aftbed.core.errors import ConfigError, ScriptError
 from aftbed.core.graph import BrickSpec
@@ -70,7 +70,7 @@ names = st.builds(  # cheaper than a regular expression
     st.just("") | st.text(ascii_lowercase, min_size=1, max_size=5).map("{}.".format),
     st.text(ascii_lowercase, min_size=1, max_size=8),
 )
-ports = st.sampled_from(PORTS)
+ports = st.sampled_from(port_names())
 sources = st.just("") | st.sampled_from(("a.b:C", "/x y/z: w.py:C", "it's.py:C", "übung.py:Übung"))
 bricks = st.builds(BrickSpec, names, st.sampled_from(tuple(KINDS)), sources, sources)
 binds = st.builds(lambda b, p, t, q: Bind(b, p, t, "" if p == q else q), names, ports, names, ports)

@@ -78,7 +78,7 @@ def test_sizes_are_said_for_people(count_bytes: float, said: str) -> None:
 
 def test_the_page_has_every_table_and_plot_and_no_script() -> None:
     page = html_page(made_up())
-    assert page.count("<table>") == len(tables(made_up())) and page.count('class="plot"') == 5
+    assert page.count("<table>") == len(tables(made_up())) and page.count('class="plot') == 5
     assert "<script" not in page and "http" not in re.sub(r'xmlns="[^"]*"', "", page)
 
 
@@ -89,14 +89,16 @@ def test_the_page_escapes_what_it_is_given() -> None:
 
 def test_a_sweep_without_points_is_no_plot() -> None:
     bare = msgspec.structs.replace(made_up(), state=(), load=())
-    assert html_page(bare).count('class="plot"') == 1
+    page = html_page(bare)
+    assert page.count('class="plot') == page.count('<figure class="bars">') == 1, "bars, and a legend of bars"
+    assert page.count('class="plot broad"') == 1, "as wide as the page"
 
 
 @needs_browser
 @pytest.mark.process
 def test_the_page_in_a_browser_has_all_in_its_place(tmp_path: Path) -> None:
     dom, console = in_browser(tmp_path, measured(html_page(made_up())))
-    assert console == [] and "<title>measured 0 0 0 1 0</title>" in dom and dom.count('class="plot"') == 5
+    assert console == [] and "<title>measured 0 0 0 1 0</title>" in dom and dom.count('class="plot') == 5
 
 
 def test_the_benches_leave_the_libraries_of_pages_alone() -> None:

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Final
 
 import msgspec
 import pytest
@@ -119,6 +120,34 @@ def test_requirements_are_those_of_the_campaign_and_of_its_scenario(tmp_path: Pa
     )
     text = CRASHES.replace("system: {", f"verifies: [SG-1, FSR-3.2]\nsystem: {{scenario: {scenario}, ")
     assert planned(tmp_path, text).spec.verifies == ("SG-1", "FSR-3.2", "SG-2")
+
+
+SCENARIO: Final = "{description: empty, duration_s: 1, ego: {speed_kmh: 50}, expect: {outcome: no_braking}}"
+
+
+def test_files_are_looked_up_beside_the_campaign_and_then_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    beside, here = tmp_path / "beside", tmp_path / "here"
+    beside.mkdir()
+    here.mkdir()
+    monkeypatch.chdir(here)
+    driven = CRASHES.replace("system: {", "system: {scenario: roads/road.yaml, ")
+    asked = CRASHES.replace("system: {", "system: {request_file: sent.csv, ")
+    for text, key, name in (
+        (driven, "scenario", "roads/road.yaml"),
+        (asked, "request_file", "sent.csv"),
+        (CRASHES.replace("system: {", "system: {app: my.py:Sum, "), "app", "my.py"),
+    ):
+        found = refusal(beside, text)
+        told = (
+            f"try.yaml: system.{key}: .*/beside/{name}: no such file, beside the campaign file or in {here}$"
+        )
+        assert re.search(told, found), found
+    for folder in (here, beside):  # what is beside the file comes first
+        (folder / "roads").mkdir()
+        (folder / "roads/road.yaml").write_text(SCENARIO)
+        assert planned(beside, driven).spec.system.scenario == str(folder / "roads/road.yaml")
 
 
 def test_the_schema_knows_every_key() -> None:

@@ -167,7 +167,7 @@ def test_one_experiment_by_its_number(explore: Call, words: tuple[str, ...], exp
 @pytest.mark.parametrize("explorer", EXPLORERS)
 def test_a_selection_without_names_has_all_mechanisms_and_placements(explorer: str) -> None:
     whole = selected(explorer, (), (), 1)
-    assert whole.placements == PLACEMENTS and whole.ftms == EXPLORERS[explorer].ftms
+    assert whole.placements == PLACEMENTS and whole.ftms == EXPLORERS[explorer].ftms()
 
 
 def test_adaptations_from_and_to_a_mechanism_of_one_replica(explore: Call) -> None:

@@ -9,6 +9,7 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Final
+from xml.etree import ElementTree
 
 import pytest
 from fakerun import Call, Output
@@ -382,6 +383,16 @@ def test_a_failure_shows_its_last_messages_and_draws_them(sim: Call, tmp_path: P
         "broken: one_history (G3): request 3: the reply is not the bare server's" in drawn_text.splitlines()
     )
     assert (tmp_path / "last.md").read_text().startswith("sequenceDiagram\n")
+
+
+def test_a_diagram_shows_the_fault_also_as_svg(sim: Call, tmp_path: Path) -> None:
+    path = tmp_path / "run.svg"
+    code, _, _ = sim("--count", "60", "--inject", "crash primary at checkpoint.sent nth 3", "--diagram", path)
+    assert code == 0
+    title = "{http://www.w3.org/2000/svg}title"
+    tips = [one.text or "" for one in ElementTree.parse(path).iter(title)]
+    assert any("crash primary at checkpoint.sent nth 3" in tip for tip in tips)
+    assert any("replica.promoted" in tip for tip in tips)
 
 
 def test_a_diagram_of_many_is_of_the_first_that_broke(sim: Call, tmp_path: Path) -> None:

@@ -1,4 +1,8 @@
-"""State diagrams, made from the tables that the bricks execute (docs/machines.md)."""
+"""State diagrams, made from the tables that the bricks execute (docs/machines.md).
+
+All moves from a state to another share one arrow, a line each: Mermaid would draw those of a state to itself
+over each other.
+"""
 
 from collections.abc import Iterator
 
@@ -23,7 +27,19 @@ def mermaid(kind: type[Machine]) -> str:
 
 
 def _arrows(table: Table) -> Iterator[str]:
-    """One for each move. A Rebound that changes no state is left out: every brick receives it."""
+    """One for each pair of states, in the order of their first moves."""
+    arrows: dict[tuple[str, str], list[str]] = {}
+    for state, then, words in _moves(table):
+        arrows.setdefault((state, then), []).append(words)
+    for (state, then), lines in arrows.items():
+        yield f"    {state} --> {then}: {'<br/>'.join(lines)}"
+
+
+def _moves(table: Table) -> Iterator[tuple[str, str, str]]:
+    """From where, whereto, and the words of each move.
+
+    A Rebound that changes no state is left out: every brick receives it.
+    """
     moves = [
         (state, port, kind, f" [{do.__name__} = {getattr(answer, 'name', answer)}]", *move)
         for (state, port, kind), (do, _, answers) in table.rows.items()
@@ -41,4 +57,4 @@ def _arrows(table: Table) -> Iterator[str]:
         if state in reached and (kind is not Rebound or then is not state):
             message = kind.__name__ if port == CONTROL else f"{port} {kind.__name__}"
             name = do.__qualname__.rpartition(".")[2]
-            yield f"    {state.name} --> {then.name}: {message}{answer} / {name}"
+            yield state.name, then.name, f"{message}{answer} / {name}"

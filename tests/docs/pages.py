@@ -23,6 +23,7 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 PAGES: Final = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 
 _LINK: Final = re.compile(r"(?<!!)\[[^\]]+\]\(([^)\s]+)\)")
+_IMAGE: Final = re.compile(r"!\[[^\]]+\]\(([^)\s]+)\)")
 _HEADING: Final = re.compile(r"#{1,6} (.+)")
 _CODE: Final = re.compile(r"`([^`]+)`")
 
@@ -88,6 +89,11 @@ def prose(page: Path) -> str:
 def links(page: Path) -> list[str]:
     """The targets of all links."""
     return _LINK.findall(prose(page))
+
+
+def images(page: Path) -> list[str]:
+    """The targets of all images; each has words for those who do not see it."""
+    return _IMAGE.findall(prose(page))
 
 
 def anchors(page: Path) -> set[str]:

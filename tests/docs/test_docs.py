@@ -8,7 +8,7 @@ from typing import Final
 
 import pytest
 import typer
-from pages import PAGES, ROOT, anchors, blocks, links, names, prose, sections, table
+from pages import PAGES, ROOT, anchors, blocks, images, links, names, prose, sections, table
 from requestpath import REQUEST_PATH
 
 from aftbed.cli import EXIT_READER_GONE, EXIT_USAGE
@@ -28,6 +28,7 @@ from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
 
 DOCS: Final = ROOT / "docs"
 README: Final = ROOT / "README.md"
+PICTURE_BYTES_MAX: Final = 200_000
 NOT_OURS: Final = {"--rewrite"}  # options of other programs
 _PATH: Final = re.compile(r"(?<![\w./-])aftbed/[\w/]+(?:\.py|/)(?!\w)")
 _FILE: Final = re.compile(r"(?:[a-z_]+/)*[a-z_]+\.py")
@@ -61,7 +62,7 @@ COMMANDS: Final = dict(commands())
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_relative_link_leads_somewhere(page: Path) -> None:
-    for link in links(page):
+    for link in (*links(page), *images(page)):
         if "://" in link:
             continue
         path, _, anchor = link.partition("#")
@@ -70,6 +71,15 @@ def test_every_relative_link_leads_somewhere(page: Path) -> None:
         assert target.is_relative_to(ROOT), f"{page.name}: {link} leads out of the project"
         if anchor:
             assert anchor in anchors(target), f"{page.name}: {link}; there are {sorted(anchors(target))}"
+
+
+def test_every_picture_is_small_and_shown() -> None:
+    shown = {(page.parent / image).resolve() for page in PAGES for image in images(page)}
+    pictures = set((DOCS / "pictures").iterdir())
+    assert pictures <= shown and len(pictures) >= 4
+    assert all(path.stat().st_size < PICTURE_BYTES_MAX for path in pictures), (
+        "make pictures makes them smaller"
+    )
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -15,9 +15,9 @@ PAGE: Final = ROOT / "docs" / "machines.md"
 HEAD: Final = """# The state machines of the bricks
 
 Made from the tables that the bricks execute ([how to read one](bricks.md#how-to-read-one)); do not edit.
-An arrow is a row: `port message [question = answer] / handler`. A message from the runtime has no port. A
-message without an arrow is refused. A Rebound that changes no state is left out: every brick receives it. The
-Watchdogs and Recovery have no states.
+A line at an arrow is a row: `port message [question = answer] / handler`. A message from the runtime has no
+port. A message without a line is refused. A Rebound that changes no state is left out: every brick gets it.
+The Watchdogs and Recovery have no states.
 """
 
 
@@ -48,3 +48,12 @@ def test_a_diagram_shows_each_row_and_each_answer() -> None:
         text = mermaid(kind)
         for table in kind.TABLES.values():
             assert all(state.name in text for state, ports in table.open_ports.items() if ports)
+
+
+def test_moves_between_the_same_states_share_an_arrow() -> None:
+    text = mermaid(machines()["Protocol"])
+    assert "IDLE --> IDLE: pxy2pro Request [age = OLD] / answer_again" in text
+    for kind in machines().values():
+        for diagram in mermaid(kind).split("```mermaid")[1:]:
+            arrows = [line.partition(":")[0] for line in diagram.splitlines() if "-->" in line]
+            assert len(set(arrows)) == len(arrows)

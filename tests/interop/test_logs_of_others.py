@@ -173,6 +173,21 @@ def test_a_replay_has_the_same_frames_from_every_format(tmp_path: Path) -> None:
         assert read_for_replay(tmp_path / f"a.{name}").frames == found
 
 
+@pytest.mark.parametrize("ending", ["asc", "blf", "csv", "log", "trc"])
+def test_a_replay_reads_what_python_can_has_logged(ending: str, tmp_path: Path) -> None:
+    """But for the date of an ASC, whose start python-can writes anew."""
+    sent = [(1_700_000_000_001_000 + 50_000 * n, 0x300 + n % 3, bytes([n] * (n % 9))) for n in range(20)]
+    with can.Logger(tmp_path / f"theirs.{ending}") as logger:
+        for t_us, can_id, data in sent:
+            logger(can.Message(t_us / 1e6, can_id, False, data=data, channel="can0", is_rx=True))
+    found = read_for_replay(tmp_path / f"theirs.{ending}")
+    first_us = found.frames[0].t_us if ending == "asc" else sent[0][0]
+    assert [(one.t_us - first_us, one.can_id, one.data) for one in found.frames] == [
+        (t_us - sent[0][0], can_id, data) for t_us, can_id, data in sent
+    ]
+    assert found.report.frames == 20 and not found.report.left_out
+
+
 # -- what cannot be read is skipped
 
 

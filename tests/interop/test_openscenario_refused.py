@@ -24,14 +24,22 @@ from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, im
 # -- what is refused
 
 
+TELEPORT = (
+    '<TeleportAction><Position><LanePosition roadId="1" laneId="-1" s="1"/></Position></TeleportAction>'
+)
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
         ([(LONGITUDINAL, LATERAL)], "line 122: LateralAction: lateral motion"),
         ([(LONGITUDINAL, "<RoutingAction/>")], "line 122: RoutingAction: routes"),
         ([(LONGITUDINAL, "<SynchronizeAction/>")], "SynchronizeAction: the speed of the car ahead"),
-        ([(LONGITUDINAL, "<TeleportAction/>")], "PrivateAction: found TeleportAction, allowed is Longitud"),
-        ([("<CatalogLocations/>", "<Wormhole/>")], "line 15: Wormhole: not expected here"),
+        ([(LONGITUDINAL, TELEPORT)], "PrivateAction: found TeleportAction, allowed is Longitud"),
+        (
+            [("<CatalogLocations/>", "<Wormhole/>")],
+            "line 15: Wormhole: not allowed here in OpenSCENARIO, allowed is VariableDeclarations or",
+        ),
         ([("<Init>", "<Init>text")], "Init: text is not expected here"),
         (
             [(RATE, RATE.replace("linear", "sinusoidal"))],
@@ -100,7 +108,7 @@ from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, im
                     '<Condition conditionEdge="none" delay="0" name="x"/><Condition name="y"',
                 )
             ],
-            "Condition: found nothing, allowed is ByValueCondition or ByEntityCondition",
+            "Condition: found nothing, allowed is ByEntityCondition or ByValueCondition",
         ),
         (
             [('value="0" rule="greaterThan"', 'value="4" rule="greaterThan"')],
@@ -128,7 +136,7 @@ from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, im
         ),
         (
             [('<Act name="act">\n        <Man', '<Act name="act">\n        <Many/><Man')],
-            "Many: not expected here",
+            "Many: not allowed here in Act, allowed is ManeuverGroup",
         ),
         (
             [

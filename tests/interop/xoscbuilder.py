@@ -149,6 +149,7 @@ def scenario(
     for name, ones in init.items():
         private = "".join(f"<PrivateAction>{one}</PrivateAction>" for one in ones)
         actions += f'<Private entityRef="{name}">{private}</Private>'
+    told = f'<Story name="story">\n{story}\n</Story>' if story else ""
     road_file = "$Road" if "Road" in (parameters or {}) else "road.xodr"
     return document(
         "a drive",
@@ -159,9 +160,7 @@ def scenario(
 <Entities>{things}</Entities>
 <Storyboard>
 <Init><Actions>{world}{actions}</Actions></Init>
-<Story name="story">
-{story}
-</Story>
+{told}
 {stop}
 </Storyboard>""",
     )

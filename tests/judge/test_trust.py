@@ -17,6 +17,7 @@ import pytest
 from records import outcomes, whole
 
 from aftbed.core.events import Event
+from aftbed.core.installed import search_path
 from aftbed.functions.load import load_module
 from aftbed.functions.source import parse_source
 from aftbed.judge.checks import Evidence
@@ -123,7 +124,7 @@ def test_neither_the_record_nor_the_working_directory_is_searched(
         as_module = Planted(tmp_path / place, name="evil_module.py")
         monkeypatch.chdir(tmp_path / place)
         monkeypatch.syspath_prepend(str(tmp_path / place))  # as of `python -m`
-        assert str(Path.cwd()) not in trust.search_path()
+        assert str(Path.cwd()) not in search_path()
         for number, source in enumerate(
             ("evil:Mine", "evil.inner:Mine", "evil_module:Mine", "evil_module.py:Mine")
         ):

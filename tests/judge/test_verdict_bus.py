@@ -7,7 +7,11 @@ import msgspec
 import pytest
 from records import CAR, STOPPED, RecordInTheMaking, whole
 
+from aftbed.cli.check import write_html
 from aftbed.cli.views import show_verdict
+from aftbed.vehicle.can.bus_load import BusLoad
+from aftbed.vehicle.can.candump import log_line
+from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.hub import HubCounts, Stranger
 
 LISTENER: Final = Stranger(1000, connections=2)
@@ -83,3 +87,46 @@ def test_a_bus_that_was_opened_later_on_paper_is_a_contradiction(path: Path) -> 
     told = "run.json and end.json do not agree whether the bus was open to all"
     assert record.verdict().reasons == [f"sources_agree: {told}"]
     assert record.verdict().verdict == "fail"
+
+
+def logged(path: Path, *strangers: Stranger) -> RecordInTheMaking:
+    """A drive with 100 frames of 8 bytes in each of ten windows, at 250 kbit/s; the hub counted them."""
+    record = drive(path, *strangers, frames=1001)
+    record.options = msgspec.structs.replace(
+        record.options, work=msgspec.structs.replace(CAR, bitrate_bps=250_000)
+    )
+    frames = (Frame(1_000 * n, 0x100, bytes(8)) for n in range(1001))
+    (path / "bus.log").write_text("".join(log_line(frame, "can0") for frame in frames))
+    return record
+
+
+def test_the_load_of_the_bus_is_in_the_verdict_and_shown(
+    path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    verdict = logged(path).verdict()
+    assert verdict.bus_load == BusLoad(250_000, 10, 54.0, 54.0, 44.4, 44.4)
+    show_verdict(verdict, as_json=True)
+    assert '"bus_load":{"bitrate_bps":250000,"windows":10,"p50_percent":54.0' in capsys.readouterr().out
+    show_verdict(verdict, as_json=False)
+    assert "  bus load   54.0 % (p50), 54.0 % at most\n" in capsys.readouterr().out
+
+
+def test_a_run_without_a_bus_has_no_load(path: Path) -> None:
+    assert whole(path).verdict().bus_load is None
+
+
+@pytest.mark.parametrize("log", [True, False])
+def test_the_report_has_the_load_and_who_else_was_on_the_bus(path: Path, tmp_path: Path, log: bool) -> None:
+    """Also where there was no frame, as of one that was turned away while the run started."""
+    away = Stranger(1001, turned_away=2)
+    record = logged(path, FORGER, away) if log else drive(path, FORGER, away)
+    verdict = record.verdict()
+    write_html(tmp_path / "run.html", path, verdict)
+    page = (tmp_path / "run.html").read_text()
+    said = "Load at 250 kbit/s over 10 windows of 100 ms: 54.0 % (p50), 54.0 % at most"
+    assert (said in page) == log
+    assert (
+        "<li>a stranger of user 1000: 1 on the bus, 9 frames (forged: 5 AEB_REQ, 1 RADAR_TRACK, 2 0x7FF)</li>"
+    ) in page
+    assert "<li>a stranger of user 1001: 2 turned away</li>" in page
+    assert 'href="#bus"' in page and "Nobody but" not in page

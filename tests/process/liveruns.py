@@ -54,7 +54,10 @@ SHOWN_BYTES: Final = 3000  # of the output of a run, where a test fails
 ENDLESS: Final = 10_000_000  # requests: the run goes on until it is stopped, on a machine of any speed
 SHORT: Final = Path(__file__).with_name("short.yaml")  # a scenario
 # commands that start no process
-PLAIN: Final = ("adapt", "check", "ftm", "graph", "inject", "log", "map", "ps", "sim", "status", "stop")
+PLAIN: Final = (
+    *("adapt", "check", "ftm", "graph", "init", "inject", "log", "map", "ps", "schema", "sim", "status"),
+    "stop",
+)
 
 __all__ = [  # what others import from here
     "ADAPT_TRIES",

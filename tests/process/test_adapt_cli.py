@@ -68,6 +68,11 @@ def nodes() -> int:
     return sum(row["node"] for row in json.loads(aftbed("ps", "--json").out))
 
 
+def offered(*words: str) -> list[str]:
+    """What a shell offers behind `words`; where the run has no time to answer, that is not of it."""
+    return aftbed("completion", "answer", "--", *words).out.splitlines()
+
+
 def stopped(command: Command) -> Done:
     """Stop the run: it passes, and nothing was lost, doubled or wrong."""
     assert aftbed("stop").code == 0
@@ -84,6 +89,7 @@ def test_a_run_is_composed_switched_and_decomposed_by_command(run: Command) -> N
     assert (composed["bricks_changed"], composed["bricks_total"]) == (10, 22)
     assert 0.0 < float(str(composed["blackout_ms"])) < float(str(composed["total_ms"]))
     assert status()["ftm"] == "pbr+tr" and nodes() == 23
+    until(lambda: "a/tr.before" in offered("inject", "crash", "a/"), "the nodes that a shell is offered")
     assert done("switch", "lfr+tr")["bricks_changed"] == 4
     assert done("decompose")["ftm"] == "lfr"
     assert nodes() == 17

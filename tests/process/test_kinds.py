@@ -9,7 +9,7 @@ from typing import Final
 import pytest
 from liveruns import Done, forked, home
 
-from aftbed.cli.new_function import KINDS, create
+from aftbed.cli.init import KINDS, create
 
 pytestmark = [pytest.mark.process, pytest.mark.deep, pytest.mark.timeout(3600)]
 

@@ -19,12 +19,15 @@ from liveruns import Command, Home, aftbed, ended, forked, until
 
 from aftbed.report import live_page
 from aftbed.runtime.unix import run_directory
+from aftbed.runtime.unix.control_client import processes
+from aftbed.vehicle.can.bus_model import frame_bits
 
 pytestmark = pytest.mark.process
 
 NOBODY: Final = 65534
 SECONDS_MAX: Final = 20.0
 ENDLESS: Final = ("--load", "1000000@100")
+DRIVE: Final = ("--scenario", "free-drive", "--pace", "0.2")
 
 
 @pytest.fixture
@@ -91,7 +94,7 @@ def snapshots(line: socket.socket) -> Iterator[live_page.Snapshot]:
 
 @needs_browser
 def test_it_shows_a_crash_and_a_composition_that_its_buttons_asked_for(home: Home, tmp_path: Path) -> None:
-    with Command("--web", "--scenario", "free-drive", "--pace", "0.2") as command:
+    with Command(*DRIVE, "--web") as command:
         command.wait_until_it_drives()
         with driven(tmp_path) as page:
             page.open(address(command))
@@ -185,6 +188,40 @@ def test_a_browser_that_does_not_read_holds_up_nobody(run: Command) -> None:
         assert not [one.status for one in seen if one.status["run"] != first.status["run"]]
     done = run.done()
     assert done.code == 0, done.out + done.err
+
+
+def test_a_run_that_is_stopped_for_a_while_has_not_ended(run: Command) -> None:
+    """Its pages are told that it does not answer, and go on when it does."""
+    shown = address(run)
+    supervisor = next(row.pid for row in processes(run_directory.find(None)) if row.name == "supervisor")
+    with stream(shown) as line:
+        seen = snapshots(line)
+        assert not next(seen).silent_s
+        os.kill(supervisor, signal.SIGSTOP)
+        try:
+            silent = next(one for one in seen if one.silent_s > 2.5)
+        finally:
+            os.kill(supervisor, signal.SIGCONT)
+        assert len(silent.nodes) == 16
+        later = next(one for one in seen if not one.silent_s)
+        assert later.status["seconds"] != silent.status["seconds"]
+        assert told(shown, "stop")[0] == 0
+        assert all(not one.silent_s for one in seen)
+    done = run.done()
+    assert done.code == 0, done.out + done.err
+
+
+def test_the_load_of_the_bus_is_that_of_the_drive(home: Home) -> None:
+    """Of RADAR_TRACK, AEB_REQ, BRAKE_STATUS and EGO_STATE, at 50 kbit/s: some 40 %, and never none."""
+    with Command(*DRIVE, "--web", "--bitrate", "50000") as command:
+        command.wait_until_it_drives()
+        shown = address(command)
+        with stream(shown) as line:
+            one = next(one for one in snapshots(line) if one.load_percent)
+            assert one.frames_s and one.load_percent
+            assert one.load_percent == pytest.approx(one.frames_s * frame_bits(8) / 500, rel=0.05)
+            assert told(shown, "stop")[0] == 0
+        assert command.done().code == 0
 
 
 def test_it_ends_with_the_command_whatever_ends_that(run: Command) -> None:

@@ -11,7 +11,7 @@ from typing import Final
 
 import pytest
 from busharness import DEADLINE_S, RawClient
-from liveruns import Home, Started, until
+from liveruns import Home, Started, aftbed, until
 
 from aftbed.runtime.unix.options import CarRun
 from aftbed.runtime.unix.run_directory import members
@@ -71,6 +71,8 @@ def test_a_flood_of_forged_frames_does_not_starve_a_run_and_is_told(home: Home, 
     (stranger,) = verdict.strangers
     assert stranger.forged == {"RADAR_TRACK": stranger.frames} and stranger.put_out_fast
     assert any(text.endswith("is on the bus") for text in outcome.told("bus"))
+    assert aftbed("check", tmp_path / "record", "--html", tmp_path / "run.html").code == 3
+    assert f"{stranger.frames} RADAR_TRACK)" in (tmp_path / "run.html").read_text()
     files = [path for path in (tmp_path / "record").rglob("*") if path.is_file()]
     of_the_test = "\0".join(os.environ.values()).encode()
     assert seen and set(SECRET.findall(seen)) <= set(SECRET.findall(of_the_test))

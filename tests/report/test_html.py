@@ -15,7 +15,7 @@ from reported import HOSTILE, MACHINE, hostile, named, summary_of, with_results
 from aftbed.campaign.ledger import Ledger
 from aftbed.campaign.spec import Gate
 from aftbed.judge.outcome import OUTCOMES
-from aftbed.report.html import DRAWN_MAX, html_report, percent
+from aftbed.report.html import COLUMNS_MAX, DRAWN_MAX, html_report, percent
 from aftbed.report.plots import LINES
 from aftbed.report.worst import by_badness
 
@@ -148,6 +148,20 @@ def test_rows_with_other_faults_are_another_table(text: str, ledger: Ledger, tmp
     assert page.classes["counts"] == len(summary.strata) == 6
 
 
+@pytest.mark.parametrize(
+    ("faults", "corner", "columns"),
+    [(COLUMNS_MAX, "mechanism", COLUMNS_MAX), (COLUMNS_MAX + 1, "fault", 2)],
+)
+def test_a_matrix_with_many_faults_is_turned(ledger: Ledger, faults: int, corner: str, columns: int) -> None:
+    names = [f"{ftm} · process · fault {number}" for ftm in ("pbr", "lfr") for number in range(faults)]
+    few = with_results(ledger, *(named(result("masked", index=n), name) for n, name in enumerate(names)))
+    page = html_report(summary_of(few), few, drawn=0)
+    table = page[page.index('<table class="matrix">') :].partition("</table>")[0]
+    head = re.findall("<th>(.*?)</th>", table.partition("</thead>")[0])
+    assert head[0] == corner and len(head) == 1 + columns
+    assert table.count('class="counts"') == len(names) and "empty" not in table
+
+
 def test_more_rows_than_styles_are_one_line_for_each_mechanism(ledger: Ledger) -> None:
     """Two lines of one style could not be told apart."""
     names = [f"pbr · to {number} · crash primary" for number in range(len(LINES) + 1)]
@@ -245,5 +259,6 @@ def test_the_templates_are_part_of_the_package() -> None:
         "report.html.j2",
         "run.html.j2",
         "spacetime.html.j2",
+        "spacetime.svg.j2",
         "swatch.html.j2",
     }

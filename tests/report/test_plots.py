@@ -1,7 +1,11 @@
 """Plots: their words and tooltips, where their points lie, and that equal data give equal bytes."""
 
+import html
+import re
 import subprocess
 import sys
+from itertools import pairwise
+from pathlib import Path
 from random import Random
 from typing import Final
 from xml.etree import ElementTree
@@ -10,17 +14,24 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from aftbed.report import plots
 from aftbed.report.plots import (
+    BAD,
+    COLOURS,
     HEIGHT,
     LINES,
     POINTS_MAX,
+    RANGES_PX,
     WIDTH,
+    FttiCurve,
     Limit,
     RoadCurve,
     RoadPoint,
+    TimeBand,
     TimeRange,
     curves,
     ecdf,
+    ftti_plot,
     line_style,
     ranges,
     road_plot,
@@ -44,11 +55,11 @@ def titles(drawing: str) -> list[str]:
 
 
 def lines_of(drawing: str, css: str = "line") -> list[list[tuple[float, float]]]:
-    """The points of each path with a tooltip of that class."""
+    """The points of each line with a tooltip of that class, without its dots."""
     found = []
     for group in elements(drawing, "g"):
         if group.get("class") == css:
-            (path,) = [e for e in group.iter() if e.tag.removeprefix(SVG) == "path"]
+            path, *_ = [e for e in group.iter() if e.tag.removeprefix(SVG) == "path"]
             numbers = [float(word) for word in path.get("d", "").split() if word not in "MLz"]
             found.append(list(zip(numbers[::2], numbers[1::2], strict=True)))
     return found
@@ -178,6 +189,9 @@ def test_a_range_has_a_bar_for_each_side_that_is_known() -> None:
     ours, theirs, alone = lines_of(drawing, "range")
     assert ours[0][0] < ours[-1][0] < theirs[0][0] < theirs[-1][0] < alone[0][0]
     assert theirs[0][1] < ours[0][1] < alone[0][1]  # the paper's above ours
+    root = ElementTree.fromstring(drawing)
+    assert (root.get("width"), root.get("class")) == (f"{RANGES_PX:g}", "plot broad"), "as wide as a page"
+    assert alone[-1][0] > 0.9 * RANGES_PX
 
 
 # -- the table of the road
@@ -193,23 +207,105 @@ road_curves = st.builds(
 )
 
 
-def test_a_line_for_each_mechanism_and_length_in_a_picture_for_each_group() -> None:
+def paths(drawing: str, colour: str) -> list[list[tuple[float, float]]]:
+    """The points of the paths that are stroked in that colour, those of the legend last."""
+    found = []
+    for path in elements(drawing, "path"):
+        if f"stroke: {colour}" in path.get("style", ""):
+            numbers = [float(word) for word in path.get("d", "").split() if word not in "MLz"]
+            found.append(list(zip(numbers[::2], numbers[1::2], strict=True)))
+    return found
+
+
+def test_a_panel_for_each_mechanism_and_length_so_that_no_line_covers_another() -> None:
     rows = (RoadPoint(10, 0, 0, 0), RoadPoint(60, 20, 35, 25))
     names = ("pbr, crash", "outage 300ms")
     drawing = road_plot("r152", [RoadCurve(group, name, rows) for group in ("m1", "n1") for name in names])
     assert ElementTree.fromstring(drawing).tag == f"{SVG}svg", "a file of its own has its namespace"
     assert "var(--" not in drawing and drawing.endswith("</svg>\n")
     said = texts(drawing)
-    assert {"r152", "m1", "n1", *names, "allowed by the table"} <= set(said)
-    assert said.count("allowed by the table") == 1  # in the legend
-    assert titles(drawing) == [f"{name}: up to 20.0 km/h" for _ in ("m1", "n1") for name in names]
-    assert drawing.count("stroke-dasharray: 2,3") == 2 + 1  # what is allowed, and the legend
+    assert [word for word in said if word in names] == [*names, *names]
+    assert {"r152", "m1", "n1"} <= set(said)
+    assert said.count("speed of the row, km/h") == 4 and said.count("speed at impact, km/h") == 2
+    of_panel = ("10 km/h: impact 0.0 km/h, allowed none", "60 km/h: impact 20.0 km/h, allowed 35 km/h")
+    assert titles(drawing) == [
+        f"{name}: {words}" for _ in ("m1", "n1") for name in names for words in of_panel
+    ]
+    left = {x for x, _ in dots(drawing)[:2]}
+    assert left.isdisjoint(x for x, _ in dots(drawing)[2:4]), "side by side"
+
+
+def test_the_legend_has_what_is_drawn_and_no_more() -> None:
+    plain, bounded = RoadPoint(10, 0, 5), RoadPoint(20, 9, 5, 10)
+    words = ["speed at impact of a row", "allowed by the table"]
+    assert sorted(texts(road_plot("t", [RoadCurve("g", "n", (plain,))]))[-2:]) == sorted(words)
+    both = texts(road_plot("t", [RoadCurve("g", "n", (plain, bounded))]))
+    assert sorted(both[-3:]) == sorted([*words, "at most, by v = sqrt(2 a (v0 t - d0))"])
+
+
+def test_what_is_allowed_is_a_line_of_steps() -> None:
+    rows = (RoadPoint(10, 0, 0), RoadPoint(20, 0, 0), RoadPoint(40, 0, 20), RoadPoint(60, 0, 35))
+    drawing = road_plot("t", [RoadCurve("g", "n", rows)])
+    steps, _ = paths(drawing, BAD)
+    assert all((x == u) != (y == v) for (x, y), (u, v) in pairwise(steps) if (x, y) != (u, v))
+    x10, x20, x40, x60 = (x for x, _ in dots(drawing)[:4])
+    turns = sorted({x for x, _ in steps})[1:-1]
+    assert turns == pytest.approx([(x10 + x20) / 2, (x20 + x40) / 2, (x40 + x60) / 2], abs=0.1)
+    assert steps[0][0] < x10 and steps[-1][0] > x60, "the first and the last level lead to the ends"
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_files_have_the_colours_of_the_pages(dark: bool) -> None:
+    """Light ones as they are, dark ones by a rule for each."""
+    css = (Path(plots.__file__).parent / "templates" / "report.css").read_text()
+    part = css.partition("@media (prefers-color-scheme: dark)")[2 if dark else 0]
+    wanted = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", part.partition("* {")[0]))
+    drawing = road_plot("t", [RoadCurve("g", "n", (RoadPoint(10, 0, 0),))])
+    for light, variable in COLOURS.items():
+        name = variable.removeprefix("var(--").removesuffix(")")
+        if dark:
+            assert f'[style*="fill: {light}"]{{fill:{wanted[name]} !important}}' in html.unescape(drawing)
+        else:
+            assert light == wanted[name], name
 
 
 def test_the_higher_impact_lies_higher() -> None:
     rows = (RoadPoint(10, 0, 0), RoadPoint(60, 20, 0))
     low, high, *_ = dots(road_plot("t", [RoadCurve("g", "n", rows)]))
     assert low[1] > high[1] and low[0] < high[0]
+
+
+# -- FTTI
+
+
+def test_a_panel_for_each_fault_with_its_closed_form_and_the_bands_beside_it() -> None:
+    faults = [
+        FttiCurve("omission", [(20, 481), (50, 201)], [(20, 489), (50, 220)]),
+        FttiCurve("hang", [(20, 481), (50, 201)], [(20, 489), (50, 220)]),
+        FttiCurve("wrong-value", [(20, 300), (50, 90)]),
+    ]
+    bands = [TimeBand("pbr", 1.9, 12.5), TimeBand("lfr", 1.8, 1.8)]
+    drawing = ftti_plot("FTTI over speed", faults, bands)
+    said = texts(drawing)
+    assert said.count("speed, km/h") == 3 and said.count("time, ms, logarithmic") == 1
+    assert {"omission", "hang", "wrong-value"} <= set(said)
+    assert sorted(said[-4:]) == ["FHTI of lfr", "FHTI of pbr", "FTTI", "closed form"]
+    of_bands = ["FHTI of pbr: 1.9 to 12.5 ms", "FHTI of lfr: 1.8 ms"]
+    least = ["omission: 201 ms at least", "hang: 201 ms at least", "wrong-value: 90 ms at least"]
+    assert titles(drawing) == [title for one in least for title in (one, *of_bands)]
+    ends = [max(x for x, _ in line) for line in lines_of(drawing)]
+    bars = [{x for x, _ in bar} for bar in lines_of(drawing, "range")]
+    assert all(len(bar) == 1 for bar in bars), "upright"
+    assert all(end < min(pbr) < min(lfr) for end, pbr, lfr in zip(ends, bars[::2], bars[1::2], strict=True))
+
+
+def test_without_bands_and_closed_form_there_is_one_line_and_one_name() -> None:
+    drawing = ftti_plot("t", [FttiCurve("hang", [(20, 481), (50, 401)])], [])
+    assert texts(drawing)[-1] == "FTTI" and "closed form" not in texts(drawing)
+    assert "time, ms" in texts(drawing) and len(lines_of(drawing)) == 1
+
+
+# -- any numbers
 
 
 @given(st.lists(road_curves, min_size=1, max_size=4))

@@ -41,6 +41,16 @@ def test_long_names_are_broken_and_make_no_page_or_column_wider(ledger: Ledger, 
         assert "<title>0</title>" in dom, what
 
 
+def test_a_matrix_of_many_faults_needs_no_scrolling_on_a_usual_screen(ledger: Ledger, tmp_path: Path) -> None:
+    names = [f"{ftm} · process · fault {number}" for ftm in ("pbr", "lfr", "pbr+tr") for number in range(8)]
+    few = with_results(ledger, *(named(result("masked", index=n), name) for n, name in enumerate(names)))
+    page = html_report(summary_of(few), few, drawn=0)
+    script = "const e = document.querySelector('.wide:has(.matrix)');"
+    script += "document.title = e.scrollWidth > e.clientWidth"
+    dom, console = in_browser(tmp_path, page.replace("</body>", f"<script>{script}</script></body>"))
+    assert console == [] and "<title>false</title>" in dom
+
+
 def test_hostile_names_run_nothing(ledger: Ledger, tmp_path: Path) -> None:
     bad = with_results(ledger, hostile())
     dom, console = in_browser(tmp_path, html_report(summary_of(bad), bad))

@@ -330,7 +330,7 @@ class IgnoredElement(msgspec.Struct, frozen=True):
 
 def refuse(root: Element) -> None:
     """Raise ConfigError with every element of the tree whose tag is in `REFUSED`."""
-    _raise(root, list(_refused(root)))
+    raise_refused(root, list(_refused(root)))
 
 
 def account(root: Element) -> list[IgnoredElement]:
@@ -339,7 +339,7 @@ def account(root: Element) -> list[IgnoredElement]:
     refused: list[tuple[Element, tuple[Cause, str]]] = []
     root.visited = True
     _account(root, ignored, refused)
-    _raise(root, refused)
+    raise_refused(root, refused)
     return ignored
 
 
@@ -371,8 +371,8 @@ def _account(
         _account(child, ignored, refused)
 
 
-def _raise(root: Element, refused: list[tuple[Element, tuple[Cause, str]]]) -> None:
-    """Raise all of `refused` in one error; its line, reason and cause are those of the weightiest."""
+def raise_refused(root: Element, refused: list[tuple[Element, tuple[Cause, str]]]) -> None:
+    """Raise ConfigError with all of `refused`; its line, reason and cause are those of the weightiest."""
     if not refused:
         return
     lines = [

@@ -8,6 +8,7 @@ story, `storyboard` the drive; `folder` imports all files of a folder. An import
     2. elements that are refused for their tag: all of them, with line and reason, in one error
     3. elements that are read, with their meaning for the drive
     4. elements that were not read: ignored (printed with the reason), or refused
+    5. what does not fit the schema is refused, unless it is ignored; also in the place of a mistake of 3 or 4
 
 A distribution gives one drive for each set of values. Sets that no scenario can express are left out, with
 the reason; if that are all, the file is refused. No file is written before every variation has been
@@ -47,6 +48,7 @@ from aftbed.interop.openscenario.expression import (
     variations_of,
 )
 from aftbed.interop.openscenario.placing import check_road, read_cars
+from aftbed.interop.openscenario.schema import fitting
 from aftbed.interop.openscenario.storyboard import ImportedDrive, StoryboardReader, UsedElement, set_aside
 from aftbed.interop.openscenario.timeline import SlowedEgo
 from aftbed.vehicle.plant import KMH_PER_MS
@@ -252,8 +254,9 @@ def _read_distribution(
     if _varied_file(root) is None:
         raise ConfigError(f"{root.path}: no ParameterValueDistribution in it")
     _read_version(root.one("FileHeader"))
-    found = variations_of(root, scenario.name, parameters, options.seed, options.pick)
-    account(root)
+    with fitting(root):
+        found = variations_of(root, scenario.name, parameters, options.seed, options.pick)
+        account(root)
     return found
 
 
@@ -262,12 +265,13 @@ def _read(
 ) -> tuple[ImportedDrive, tuple[IgnoredElement, ...]]:
     _read_version(root.one("FileHeader"))
     ego = _find_ego(root, options.ego)
-    set_aside(root, ego, catalogs, options.duration_s)
-    refuse(root)
-    cars, entries = read_cars(root, catalogs)
-    drive = StoryboardReader(root, cars, ego, options.duration_s).read()
-    check_road(root, empty=drive.lead is None)
-    return drive, tuple(one for tree in (root, *entries) for one in account(tree))
+    with fitting(root):
+        set_aside(root, ego, catalogs, options.duration_s)
+        refuse(root)
+        cars, entries = read_cars(root, catalogs)
+        drive = StoryboardReader(root, cars, ego, options.duration_s).read()
+        check_road(root, empty=drive.lead is None)
+        return drive, tuple(one for tree in (root, *entries) for one in account(tree))
 
 
 def _find_ego(root: Element, asked: str | None) -> str:

@@ -79,6 +79,7 @@ class Status(ServiceState, frozen=True, kw_only=True):
     busy: list[str]
     record: str
     port: int
+    bitrate_bps: int | None
     vehicle: Telemetry | None
     sees: Sight | None
 
@@ -134,13 +135,13 @@ def ask(private: Path, request: ControlRequest, seconds: float = ANSWER_SECONDS_
 
     Raises ConfigError with its refusal, HarnessError without an answer.
     """
-    return receive(send(private, request), seconds)
+    return receive(send(private, request, seconds), seconds)
 
 
-def send(private: Path, request: ControlRequest) -> Line[Answer]:
+def send(private: Path, request: ControlRequest, seconds: float = ANSWER_SECONDS_MAX) -> Line[Answer]:
     """Send a request, whose answer `receive` takes. Raises ConfigError if no supervisor listens."""
     try:
-        line = Line(run_directory.connect(private), decode_answer)
+        line = Line(run_directory.connect(private, min(seconds, ANSWER_SECONDS_MAX)), decode_answer)
     except OSError as error:
         raise ConfigError(f"run {private.name} does not answer: {error.strerror}") from None
     try:
@@ -172,7 +173,12 @@ def receive(line: Line[Answer], seconds: float = ANSWER_SECONDS_MAX) -> dict[str
 
 def processes(private: Path) -> list[ProcessRow]:
     """The processes of the run in `private`."""
-    return msgspec.convert(ask(private, ProcessesQuery())["processes"], list[ProcessRow])
+    return process_rows(ask(private, ProcessesQuery()))
+
+
+def process_rows(answer: dict[str, object]) -> list[ProcessRow]:
+    """Those in the answer to a ProcessesQuery."""
+    return msgspec.convert(answer["processes"], list[ProcessRow])
 
 
 def measured(rows: list[ProcessRow]) -> list[ProcessRow]:

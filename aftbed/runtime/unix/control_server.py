@@ -160,6 +160,7 @@ class ControlServer:
             busy=self._loop.tasks.names(),
             record=options.record,
             port=options.port,
+            bitrate_bps=getattr(options.work, "bitrate_bps", None),
             vehicle=work.telemetry,
             sees=work.sight,
         )

@@ -27,6 +27,8 @@ import msgspec
 from aftbed import __version__
 from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Scheduled
+from aftbed.ftm.compose import parse
+from aftbed.ftm.registry import packages_of
 from aftbed.inject.model import Fault
 from aftbed.runtime import control
 from aftbed.runtime.unix import head_start, linux, run_directory, seal
@@ -378,7 +380,8 @@ def options_for(
         ftti_ms=ftti_ms,
         verifies=verifies,
         command=command,
-        code=code_version() if evidence or verifies or record is not None else "",
+        packages=(packages := packages_of(parse(ftm))),
+        code=code_version(packages) if evidence or verifies or record is not None else "",
     )
     return options, listener
 

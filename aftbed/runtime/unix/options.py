@@ -10,6 +10,7 @@ from aftbed.core.messages import Scheduled
 from aftbed.core.units import duration, milliseconds
 from aftbed.inject.bus import BusFault
 from aftbed.inject.model import Fault
+from aftbed.vehicle.can.bus_load import BITRATE_BPS
 from aftbed.vehicle.can.bus_model import NODES
 
 COMMAND_GONE: Final = "the command is gone"  # a reason to end at once, whatever waits for an answer
@@ -35,18 +36,23 @@ class LoadRun(msgspec.Struct, frozen=True, tag=True):
 
 
 class CarRun(msgspec.Struct, frozen=True, tag=True):
-    """A drive; `pace` None is lockstep. `duration_ms`: how long it may last, else as its scenario says."""
+    """A drive; `pace` None is lockstep. `duration_ms`: how long it may last, else as its scenario says.
+
+    `bitrate_bps`: the bitrate that the load of the bus is measured by.
+    """
 
     scenario: str
     pace: float | None
     brake_policy: str
     duration_ms: int | None = None
+    bitrate_bps: int = BITRATE_BPS
 
 
 class ReplayRun(msgspec.Struct, frozen=True, tag=True):
     """A log through the bus: the file `log`. Its frames come with the run, since the command has read it.
 
     `loop`: behind its end it begins again. It ends after `duration_ms` at the latest, of bus time.
+    `bitrate_bps`: as of a drive.
     """
 
     log: str
@@ -55,6 +61,7 @@ class ReplayRun(msgspec.Struct, frozen=True, tag=True):
     pace: float | None
     loop: bool = False
     duration_ms: int | None = None
+    bitrate_bps: int = BITRATE_BPS
 
 
 Work = LoadRun | CarRun | ReplayRun
@@ -78,6 +85,7 @@ class RunOptions(msgspec.Struct, frozen=True):
     tolerant time interval that the verdict holds against each fault; 0: none. `verifies`: requirements, of
     the command and of the scenario. `command`: as it was typed, "" if another program launched the run.
     `code`: the version of the code, "" where the run is neither kept nor evidence of a requirement.
+    `packages`: those that declare mechanisms of `ftm` which are not ours, by name and version.
     """
 
     run: str
@@ -101,6 +109,7 @@ class RunOptions(msgspec.Struct, frozen=True):
     verifies: tuple[str, ...] = ()
     command: str = ""
     code: str = ""
+    packages: tuple[str, ...] = ()
 
 
 class SourceOptions(msgspec.Struct, frozen=True):

@@ -16,8 +16,9 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import HarnessError, StepFailed, function_failed
+from aftbed.ftm.registry import installed_mechanisms
 from aftbed.runtime import control, interface
-from aftbed.runtime.interface import ProcessKind
+from aftbed.runtime.interface import LIGHT, ProcessKind
 from aftbed.runtime.tasks import Key, Wait
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.cleanup import UndoLedger
@@ -190,7 +191,8 @@ class UnixProcessPool:
             ]
             self._unborn[zygote] += [self._add("spare", ProcessKind.SPARE, ours) for ours, _ in pairs]
             with contextlib.suppress(OSError):  # a dead zygote: its restart orders them again
-                self.zygotes[zygote].line.send(control.Park(0), tuple(end.fileno() for _, end in pairs))
+                order = control.Park(0, installed_mechanisms() if zygote == LIGHT else ())
+                self.zygotes[zygote].line.send(order, tuple(end.fileno() for _, end in pairs))
             for _, theirs in pairs:
                 theirs.close()
 

@@ -63,11 +63,7 @@ def root() -> Path:
     """The directory of all runs of this user; made if absent. Raises ConfigError if that cannot be, or if it
     is not ours.
     """
-    runtime = os.environ.get("XDG_RUNTIME_DIR")
-    if runtime and os.path.isdir(runtime):  # noqa: PTH112 - False too where this user may not look
-        path = Path(runtime) / "aftbed"
-    else:
-        path = Path(os.environ.get("TMPDIR") or "/tmp") / f"aftbed-{os.getuid()}"
+    path = _place()
     try:
         with contextlib.suppress(FileExistsError):
             path.mkdir(mode=0o700)
@@ -77,6 +73,14 @@ def root() -> Path:
     if not stat.S_ISDIR(state.st_mode) or state.st_uid != os.getuid() or state.st_mode & 0o077:
         raise ConfigError(f"{path}: must be a directory of this user alone (mode 0700); remove it")
     return path
+
+
+def _place() -> Path:
+    """Of the directory of all runs, which need not be there."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    if runtime and os.path.isdir(runtime):  # noqa: PTH112 - False too where this user may not look
+        return Path(runtime) / "aftbed"
+    return Path(os.environ.get("TMPDIR") or "/tmp") / f"aftbed-{os.getuid()}"
 
 
 def free() -> Path:
@@ -180,10 +184,10 @@ def record_directory(path: Path) -> Path:
 # -- finding live runs ----------------------------------------------------------------------------
 
 
-def connect(private: Path) -> socket.socket:
+def connect(private: Path, seconds: float = ANSWER_SECONDS_MAX) -> socket.socket:
     """A connection to the supervisor of the run in `private`; raises OSError."""
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    limit = time.monotonic() + ANSWER_SECONDS_MAX
+    limit = time.monotonic() + seconds
     try:
         sock.setblocking(False)
         while True:
@@ -195,11 +199,19 @@ def connect(private: Path) -> socket.socket:
                 time.sleep(CONNECT_PAUSE_SECONDS)  # connect(2) on a full queue gives no event to wait for
             else:
                 break
-        sock.settimeout(ANSWER_SECONDS_MAX)
+        sock.settimeout(seconds)
     except OSError:
         sock.close()
         raise
     return sock
+
+
+def owned_runs() -> list[str]:
+    """The ids of the runs whose command lives, the youngest first. Nothing is asked, waited for or made."""
+    with contextlib.suppress(OSError):
+        found = [path for path in _place().iterdir() if owned(path)]
+        return [path.name for path in sorted(found, key=lambda path: -path.stat().st_mtime)]
+    return []
 
 
 def live() -> list[str]:

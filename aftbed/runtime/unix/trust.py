@@ -37,6 +37,7 @@ import msgspec
 import aftbed
 from aftbed.core.errors import ConfigError
 from aftbed.core.input_file import open_input, read_input
+from aftbed.core.installed import search_path
 from aftbed.functions.load import Code, SourceLoader
 from aftbed.functions.source import FunctionKind, FunctionSource, parse_source
 
@@ -184,13 +185,6 @@ def _modules(parts: list[str]) -> Iterator[tuple[str, Path, tuple[str, ...]]]:
 
 def _folders_of(spec: ModuleSpec) -> list[str]:
     return [str(Path(folder).resolve()) for folder in spec.submodule_search_locations or ()]
-
-
-def search_path() -> list[str]:
-    """Where modules are looked for: `sys.path`, without the working directory unless PYTHONPATH names it."""
-    here = str(Path.cwd())
-    asked = os.environ.get("PYTHONPATH", "").split(os.pathsep)
-    return [p for p in sys.path if Path(p).is_absolute() and (p != here or p in asked)]
 
 
 def _hash(path: Path) -> str:

@@ -25,6 +25,7 @@ import msgspec
 
 from aftbed.core.errors import ConfigError, FunctionFailedError
 from aftbed.ftm.client import Client
+from aftbed.ftm.registry import find
 from aftbed.functions.load import Code, load_module
 from aftbed.functions.source import FunctionSource
 from aftbed.runtime import control
@@ -109,6 +110,9 @@ def _serve(supervisor: int, areas: tuple[Area, ...] | None) -> NoReturn:
         if areas is None and not first:
             areas = prefault.warm_up()
         first = False
+        for name in order.mechanisms:
+            with contextlib.suppress(ConfigError):  # a node that needs it will say so
+                find(name)
         try:
             _fork_spares(fds, supervisor, areas or ())
         except OSError as error:

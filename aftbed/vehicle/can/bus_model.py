@@ -111,8 +111,12 @@ def frame_bits(data_bytes: int) -> int:
     34 bits and the data are open to stuffing, at most one bit in four (Davis et al. 2007); the
     13 bits of delimiters, acknowledgement, end of frame and intermission are not.
     """
-    stuffable = 34 + 8 * data_bytes
-    return stuffable + (stuffable - 1) // 4 + 13
+    return unstuffed_bits(data_bytes) + (34 + 8 * data_bytes - 1) // 4
+
+
+def unstuffed_bits(data_bytes: int) -> int:
+    """The same without stuff bits (ISO 11898-1)."""
+    return 34 + 8 * data_bytes + 13
 
 
 Node = TypeVar("Node", bound=BusNode)

@@ -60,12 +60,12 @@ _NUMBER: Final = re.compile(r"\{n(?::(?:0([1-9]))?([xX])?)?\}")
 class RawSignal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A place in the data, as in a DBC: `start_bit` is the highest bit if big-endian, else the lowest."""
 
-    start_bit: Annotated[int, Meta(ge=0, le=63)]
-    length_bits: Annotated[int, Meta(ge=1, le=32)]
-    byte_order: Literal["big_endian", "little_endian"]
-    signed: bool = False
-    scale: Annotated[float, Meta(ge=-1e6, le=1e6)] = 1.0
-    offset: Annotated[float, Meta(ge=-1e6, le=1e6)] = 0.0
+    start_bit: Annotated[int, Meta(ge=0, le=63)]  # the highest bit if big-endian, else the lowest
+    length_bits: Annotated[int, Meta(ge=1, le=32)]  # of the signal
+    byte_order: Literal["big_endian", "little_endian"]  # as in a DBC
+    signed: bool = False  # two's complement
+    scale: Annotated[float, Meta(ge=-1e6, le=1e6)] = 1.0  # times the number in the data
+    offset: Annotated[float, Meta(ge=-1e6, le=1e6)] = 0.0  # added then
 
     def first_bit(self) -> int:
         """Bits to the left of the signal: of all data if big-endian, else to the right."""
@@ -91,10 +91,10 @@ class MappedQuantity(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Without `unit` it is in the unit that the DBC has.
     """
 
-    unit: str | None = None
-    signal: str | None = None
-    raw: RawSignal | None = None
-    scale: Annotated[float, Meta(ge=-1e6, le=1e6)] = 1.0
+    unit: str | None = None  # as m, m/s, km/h, mph, deg; none: that of the DBC
+    signal: str | None = None  # by its name in the DBC; or raw
+    raw: RawSignal | None = None  # a place in the data
+    scale: Annotated[float, Meta(ge=-1e6, le=1e6)] = 1.0  # times the value: -1 turns a direction round
 
 
 class Counter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -103,8 +103,8 @@ class Counter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     A counter of two values is none: where one frame is lost, the next looks like the one before.
     """
 
-    signal: str
-    modulo: Annotated[int, Meta(ge=3, le=65536)]
+    signal: str  # by its name in the DBC
+    modulo: Annotated[int, Meta(ge=3, le=65536)]  # it starts over here
 
 
 class E2EMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -114,13 +114,13 @@ class E2EMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     else six cycles, the sequence is void. `offset`, of the header, is in bytes.
     """
 
-    profile: Literal["p01", "p02", "p05", "p11"]
-    data_id: DataId | None = None
+    profile: Literal["p01", "p02", "p05", "p11"]  # of AUTOSAR E2E
+    data_id: DataId | None = None  # of the message
     data_ids: tuple[DataId, ...] | None = None
-    mode: P01Mode = "both"
-    offset: Annotated[int, Meta(ge=0, le=6)] = 0
-    cycle_ms: Annotated[int, Meta(ge=1, le=1000)] | None = None
-    timeout_ms: Annotated[int, Meta(ge=1, le=100_000)] | None = None
+    mode: P01Mode = "both"  # how the data id is in the CRC
+    offset: Annotated[int, Meta(ge=0, le=6)] = 0  # of the header, in bytes
+    cycle_ms: Annotated[int, Meta(ge=1, le=1000)] | None = None  # of the message; none: of the radar
+    timeout_ms: Annotated[int, Meta(ge=1, le=100_000)] | None = None  # no good frame: void
 
 
 Checksum = Sum | E2EMap
@@ -129,10 +129,10 @@ Checksum = Sum | E2EMap
 class Messages(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One message, or those whose names have the numbers `first` to `last` in the place of {n}."""
 
-    name: str
-    first: Annotated[int, Meta(ge=0, le=NUMBER_MAX)] = 0
-    last: Annotated[int, Meta(ge=0, le=NUMBER_MAX)] = 0
-    step: Annotated[int, Meta(ge=1, le=NUMBER_MAX)] = 1
+    name: str  # as in the DBC, with {n} where the number is; {n:02}, {n:x}
+    first: Annotated[int, Meta(ge=0, le=NUMBER_MAX)] = 0  # number
+    last: Annotated[int, Meta(ge=0, le=NUMBER_MAX)] = 0  # number
+    step: Annotated[int, Meta(ge=1, le=NUMBER_MAX)] = 1  # from a number to the next
 
     def numbers(self) -> range:
         return range(self.first, self.last + 1, self.step)
@@ -156,64 +156,64 @@ def numbered(name: str, number: int) -> str:
 class Flag(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Yes, if the signal has one of the values."""
 
-    signal: str
-    values: Annotated[tuple[int, ...], Meta(min_length=1)]
+    signal: str  # by its name in the DBC
+    values: Annotated[tuple[int, ...], Meta(min_length=1)]  # one of these means yes
 
 
 class ObjectCount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Where a message that comes before the objects announces how many there are."""
 
-    message: str
-    signal: str
+    message: str  # by its name in the DBC; it must be in others
+    signal: str  # with the number of objects
 
 
 class EgoMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The message with the ego speed: by `message` in the DBC, or by `can_id`. Unknown after `timeout_ms`."""
 
-    length: Length
-    speed: MappedQuantity
-    message: str | None = None
-    can_id: Annotated[int, Meta(ge=0, le=CAN_ID_MAX)] | None = None
-    checksum: Checksum = "none"
-    counter: Counter | None = None
-    timeout_ms: Annotated[int, Meta(ge=1, le=10_000)] = 200
+    length: Length  # bytes of data, as in the DBC
+    speed: MappedQuantity  # of the car
+    message: str | None = None  # by its name in the DBC; or can_id
+    can_id: Annotated[int, Meta(ge=0, le=CAN_ID_MAX)] | None = None  # where the DBC does not have the message
+    checksum: Checksum = "none"  # none, toyota, or an E2E profile
+    counter: Counter | None = None  # that rises by one with each frame
+    timeout_ms: Annotated[int, Meta(ge=1, le=10_000)] = 200  # an older speed is unknown
 
 
 class TrackMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The radar's targets. `valid`, `new`: signals that are 1 for yes, or flags; without `valid` all are."""
 
-    messages: Messages | Names
-    length: Length
-    range: MappedQuantity
-    relative_speed: MappedQuantity
-    lateral_offset: MappedQuantity | None = None
-    angle: MappedQuantity | None = None
-    slot: str | None = None
-    count: ObjectCount | None = None
+    messages: Messages | Names  # {name: ...} with first and last for numbered ones, or a list of names
+    length: Length  # bytes of data, as in the DBC
+    range: MappedQuantity  # to the target
+    relative_speed: MappedQuantity  # negative where it comes nearer
+    lateral_offset: MappedQuantity | None = None  # to the left of the middle; or angle
+    angle: MappedQuantity | None = None  # in polar coordinates
+    slot: str | None = None  # one message carries all targets: the signal with the number of each
+    count: ObjectCount | None = None  # with slot: what announces how many follow
     valid: str | Flag | None = None
     new: str | Flag | None = None
-    checksum: Checksum = "none"
-    counter: Counter | None = None
+    checksum: Checksum = "none"  # none, toyota, or an E2E profile
+    counter: Counter | None = None  # that rises by one with each frame
 
 
 class OtherMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Messages of the radar that are not needed, or only for the number of objects."""
 
-    messages: Messages | Names
-    length: Length
-    checksum: Checksum = "none"
-    counter: Counter | None = None
+    messages: Messages | Names  # {name: ...} with first and last for numbered ones, or a list of names
+    length: Length  # bytes of data, as in the DBC
+    checksum: Checksum = "none"  # none, toyota, or an E2E profile
+    counter: Counter | None = None  # that rises by one with each frame
 
 
 class MapFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    description: str
-    cycle_ms: Annotated[int, Meta(ge=1, le=1000)]
-    ego: EgoMap
-    tracks: TrackMap
-    cycle_end: str | None = None
-    others: tuple[OtherMap, ...] = ()
-    lane_half_width_m: Annotated[float, Meta(gt=0, le=10)] = 1.5
-    strict: bool = True
+    description: str  # for people
+    cycle_ms: Annotated[int, Meta(ge=1, le=1000)]  # how often the radar reports
+    ego: EgoMap  # the message with the car's own speed
+    tracks: TrackMap  # the radar's targets
+    cycle_end: str | None = None  # the message that ends a cycle of the radar; not with tracks.count
+    others: tuple[OtherMap, ...] = ()  # messages that are judged, and not used
+    lane_half_width_m: Annotated[float, Meta(gt=0, le=10)] = 1.5  # a target beyond is not in our path
+    strict: bool = True  # false: take messages of the DBC that contradict themselves, too
 
 
 SHIPPED: Final = Path(__file__).resolve().parent / "maps"  # maps, and the DBCs that go with them

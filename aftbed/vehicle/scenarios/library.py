@@ -13,7 +13,7 @@ brakes). Each row of a published table (`tables`) is a scenario too, by the name
 from pathlib import Path
 from typing import Final
 
-from aftbed.core.errors import unknown
+from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.yaml_file import read_yaml
 from aftbed.vehicle.scenarios.scenario import Scenario, ScenarioKeys, scenario_of
 from aftbed.vehicle.scenarios.tables import SEPARATOR, case_scenario
@@ -29,6 +29,19 @@ def scenario_names() -> list[str]:
 def names_file(name_or_path: str) -> bool:
     """Whether it is the path of a file, not a name."""
     return "/" in name_or_path or name_or_path.endswith((".yaml", ".yml"))
+
+
+def located_scenario(name_or_path: str, folder: Path) -> str:
+    """An absolute path, where it is the path of a file; a relative one is looked up in `folder`.
+
+    Raises ConfigError where there is no such file.
+    """
+    if not names_file(name_or_path):
+        return name_or_path
+    path = (folder / name_or_path).resolve()
+    if not path.is_file():
+        raise ConfigError(f"{name_or_path}: {path}: no such file")
+    return str(path)
 
 
 def load_scenario(name_or_path: str) -> Scenario:

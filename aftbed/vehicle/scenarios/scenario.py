@@ -36,9 +36,9 @@ Lag = Annotated[float, Meta(ge=0, le=2)]
 class Expectation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What the drive must come to. The two limits apply whatever the outcome."""
 
-    outcome: Outcome
-    impact_speed_kmh_max: Speed = 0.0
-    stop_gap_m_min: Distance = 0.0
+    outcome: Outcome  # stop, no_collision, no_braking, or impact
+    impact_speed_kmh_max: Speed = 0.0  # for impact
+    stop_gap_m_min: Distance = 0.0  # if it stops, how far from the car ahead at least
 
 
 class SlowEnd(msgspec.Struct, frozen=True):
@@ -62,76 +62,76 @@ class Scenario(msgspec.Struct, frozen=True):
 
 
 class EgoKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    speed_kmh: Speed
+    speed_kmh: Speed  # at the start
 
 
 class BrakingKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Euro NCAP gives the car ahead one second to reach its deceleration."""
 
-    after_s: Duration
-    deceleration_ms2: Deceleration
-    ramp_s: Duration = 1.0
-    to_kmh: Speed = 0.0
+    after_s: Duration  # when it begins to brake
+    deceleration_ms2: Deceleration  # how hard
+    ramp_s: Duration = 1.0  # the time in which it gets there
+    to_kmh: Speed = 0.0  # the speed at which it brakes no more
 
 
 class LeadSpeedKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    after_s: Duration
-    to_kmh: Speed
-    rate_ms2: Annotated[float, Meta(gt=0, le=12)]
+    after_s: Duration  # when it begins
+    to_kmh: Speed  # the speed to which it goes, up or down
+    rate_ms2: Annotated[float, Meta(gt=0, le=12)]  # how fast
 
 
 class CutInKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    after_s: Duration
-    over_s: Annotated[float, Meta(gt=0, le=60)]
+    after_s: Duration  # when it begins to come to the middle of our lane
+    over_s: Annotated[float, Meta(gt=0, le=60)]  # how long that takes
 
 
 class LeadKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Either `gap_m`, or the time in which the ego would close it: `ttc_s`."""
 
-    speed_kmh: Speed
-    gap_m: Distance | None = None
-    ttc_s: Annotated[float, Meta(gt=0, le=60)] | None = None
-    braking: BrakingKeys | None = None
-    speeds: tuple[LeadSpeedKeys, ...] = ()
-    lateral_m: Annotated[float, Meta(ge=-10, le=10)] = 0.0
-    cut_in: CutInKeys | None = None
+    speed_kmh: Speed  # at the start
+    gap_m: Distance | None = None  # at the start; this or ttc_s
+    ttc_s: Annotated[float, Meta(gt=0, le=60)] | None = None  # the gap as time to contact
+    braking: BrakingKeys | None = None  # how it brakes
+    speeds: tuple[LeadSpeedKeys, ...] = ()  # changes of its speed, in their order, instead of braking
+    lateral_m: Annotated[float, Meta(ge=-10, le=10)] = 0.0  # to the left of the middle of our lane
+    cut_in: CutInKeys | None = None  # how it comes into our lane; needs lateral_m
 
 
 class RoadKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    friction: Annotated[float, Meta(gt=0, le=1.2)] = 0.9
+    friction: Annotated[float, Meta(gt=0, le=1.2)] = 0.9  # of the tyres: 0.9 dry, 0.6 wet, 0.3 snow
 
 
 class BrakesKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    dead_time_s: Lag = DEAD_TIME_MS / 1000
-    lag_s: Lag = LAG_MS / 1000
-    jerk_max_ms3: Annotated[float, Meta(gt=0, le=1000)] | None = None
-    deceleration_max_ms2: Annotated[float, Meta(gt=0, le=12)] | None = None
+    dead_time_s: Lag = DEAD_TIME_MS / 1000  # how long the brakes do nothing
+    lag_s: Lag = LAG_MS / 1000  # the lag with which they follow then
+    jerk_max_ms3: Annotated[float, Meta(gt=0, le=1000)] | None = None  # how fast they build up
+    deceleration_max_ms2: Annotated[float, Meta(gt=0, le=12)] | None = None  # what they can give
 
 
 class DriverKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    reaction_s: Annotated[float, Meta(ge=0, le=10)]
-    deceleration_ms2: Deceleration
+    reaction_s: Annotated[float, Meta(ge=0, le=10)]  # how long after the warning the driver brakes
+    deceleration_ms2: Deceleration  # how hard
 
 
 class EndsKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """As in Euro NCAP's tests, which are over when the car has become slower than the one ahead."""
 
-    below_kmh: Speed | None = None
-    below_lead_kmh: Speed | None = None
-    after_s: Duration = 1.0
+    below_kmh: Speed | None = None  # the car is slower than this
+    below_lead_kmh: Speed | None = None  # the car is this much slower than the one ahead
+    after_s: Duration = 1.0  # so long after that
 
 
 class ScenarioKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    description: str
-    duration_s: Annotated[float, Meta(gt=0, le=3600)]
-    ego: EgoKeys
-    expect: Expectation
-    lead: LeadKeys | None = None
-    road: RoadKeys = RoadKeys()
-    brakes: BrakesKeys = BrakesKeys()
-    driver: DriverKeys | None = None
-    ends: EndsKeys | None = None
-    verifies: tuple[str, ...] = ()
+    description: str  # for people
+    duration_s: Annotated[float, Meta(gt=0, le=3600)]  # the longest that the drive may take
+    ego: EgoKeys  # the car with the function
+    expect: Expectation  # what the drive must come to
+    lead: LeadKeys | None = None  # the car ahead; none: the road is empty
+    road: RoadKeys = RoadKeys()  # what the tyres stand on
+    brakes: BrakesKeys = BrakesKeys()  # how they follow what is asked of them
+    driver: DriverKeys | None = None  # who brakes at the warning; none: never
+    ends: EndsKeys | None = None  # when the drive is over, before duration_s
+    verifies: tuple[str, ...] = ()  # requirements that a drive of it verifies, as [SG-1]
 
 
 def scenario_of(name: str, where: str, keys: ScenarioKeys) -> Scenario:
