@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from liveruns import SHORT, SHOWN_BYTES, Command, Home, Started, aftbed, ended, until
+from liveruns import RUN_SECONDS_MAX, SHORT, SHOWN_BYTES, Command, Home, Started, aftbed, ended, until
 from terminal import Terminal
 
 from aftbed.ftm.compose import build
@@ -243,9 +243,9 @@ def test_a_run_is_steered_by_keys(home: Home) -> None:
 
 def test_a_run_can_end_while_its_command_is_suspended(home: Home, tmp_path: Path) -> None:
     """More is reported than fits, and nothing reads it; how it ended comes through."""
-    drive = CarRun("free-drive", None, "latch", duration_ms=30_000)
+    drive = CarRun("free-drive", None, "latch", duration_ms=20_000)
     with Started(home, drive, placement="replica", record=tmp_path / "record") as run:
-        assert ended(run.launched.supervisor)
+        assert ended(run.launched.supervisor, RUN_SECONDS_MAX)
         done = run.finish()
     assert run.launched.end is not None
     assert done.verdict.verdict == "pass", done.verdict.reasons

@@ -286,8 +286,8 @@ class Workload:
     def requests(self) -> control.RequestCounts | None:
         """As last asked for."""
         match self._stats:
-            case {"sent": int(sent), "unanswered": int(unanswered)}:
-                return control.RequestCounts(sent, max(0, sent - unanswered))
+            case {"sent": int(sent), "answered": int(answered)}:
+                return control.RequestCounts(sent, answered)
         return None
 
     @property
