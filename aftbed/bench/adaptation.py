@@ -40,6 +40,7 @@ from aftbed.core.graph import PLACEMENTS
 from aftbed.core.input_file import read_input
 from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal
+from aftbed.core.progress import Show, unshown
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build, parse
 from aftbed.judge import checks
@@ -99,6 +100,7 @@ def bench_adapt(
     *,
     pin: bool = True,
     rounds: int = ROUNDS,
+    show: Show = unshown,
 ) -> AdaptationResult:
     """Adapt `count` times, and back as often. Raises HarnessError."""
     ring = ring_us(ring_of(build(old, placement)), RING_BYTES, RING_COUNT, pin=pin)
@@ -109,7 +111,7 @@ def bench_adapt(
             return _there_and_back(old, new, placement, share[number], pin=pin)
         return _each_in_a_run(old, new, placement, recipe, share[number], pin=pin)
 
-    found = in_turn(len(share), adaptations, lambda number: deaths_ms(share[number], pin=pin))
+    found = in_turn(len(share), adaptations, lambda number: deaths_ms(share[number], pin=pin), show=show)
     there, back = ([one.there for one in found.figures], [one.back for one in found.figures])
     records = [record for one in found.figures for record in one.records]
     counts = [_requests(record) for record in records]
@@ -213,15 +215,17 @@ class AdaptationTime(msgspec.Struct, frozen=True):
 Pair = tuple[str, str]
 
 
-def bench_pairs(pairs: Sequence[Pair], count: int, log: Log) -> dict[Pair, AdaptationTime]:
+def bench_pairs(
+    pairs: Sequence[Pair], count: int, log: Log, show: Show = unshown
+) -> dict[Pair, AdaptationTime]:
     """Each adaptation of `pairs` at least `count` times, under load, in one run. Raises HarnessError."""
     if not pairs:
         return {}
-    found = tried(f"{len(pairs)} adaptations, {count} times each", lambda: _walk(pairs, count, log), log)
+    found = tried(f"{len(pairs)} adaptations, {count} times each", lambda: _walk(pairs, count, show), log)
     return {pair: _time(found[pair]) for pair in pairs}
 
 
-def _walk(pairs: Sequence[Pair], count: int, log: Log) -> dict[Pair, Outcomes]:
+def _walk(pairs: Sequence[Pair], count: int, show: Show) -> dict[Pair, Outcomes]:
     """From one to the next; where none begins at what runs, there is an adaptation between them."""
     found: dict[Pair, Outcomes] = {}
     with endless_run(pairs[0][0], PLACEMENTS[0], RATE_HZ) as run:
@@ -235,13 +239,13 @@ def _walk(pairs: Sequence[Pair], count: int, log: Log) -> dict[Pair, Outcomes]:
             time.sleep(PAUSE_SECONDS)
 
         for number in range(count):
-            log(f"adaptations, {number + 1} of {count}")
             left = [pair for pair in pairs if len(found.get(pair, ())) <= number]
             while left:
                 old, new = next((pair for pair in left if pair[0] == running), left[0])
                 if running != old:
                     adapt(old)
                 adapt(new)
+                show(sum(min(count, len(found.get(pair, ()))) for pair in pairs), count * len(pairs))
                 left = [pair for pair in left if len(found.get(pair, ())) <= number]
     return found
 

@@ -16,10 +16,8 @@ experiment takes.
 import os
 import resource
 import signal
-import tempfile
 import time
 from collections import Counter
-from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
 from aftbed.bench.rounds import ROUNDS, InRounds, beside_limit, in_turn, shares
@@ -29,8 +27,10 @@ from aftbed.campaign.plan import plan
 from aftbed.campaign.spec import FaultEntry, Spec, StopRule, System, check
 from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import HarnessError
+from aftbed.core.progress import Show, unshown
 from aftbed.ftm.compose import build
-from aftbed.runtime.unix import linux
+from aftbed.runtime.unix import interrupts, linux
+from aftbed.runtime.unix.interrupts import scratch_directory
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 
 FORK_SECONDS_MAX: Final = 60.0
@@ -70,6 +70,7 @@ def bench_campaign(
     jobs: int,
     *,
     rounds: int = ROUNDS,
+    show: Show = unshown,
 ) -> CampaignResult:
     """Carry out campaigns of one stratum, a round each. Raises ConfigError."""
     share = shares(experiments, rounds)
@@ -86,7 +87,7 @@ def bench_campaign(
             return forks_ms(processes, share[number], jobs)
         return requests_ms(system.requests, share[number])
 
-    found = in_turn(len(share), lambda number: _carried_out(specs[number], jobs), limit)
+    found = in_turn(len(share), lambda number: _carried_out(specs[number], jobs), limit, show=show)
     times = [1e3 * one.seconds / len(one.results) for one in found.figures]
     name = f"fork and wait of {processes} processes" if runtime == "unix" else "its requests, bare"
     beside = beside_limit(name, [[ms] for ms in times], [[ms] for ms in found.limits])
@@ -113,9 +114,9 @@ def bench_campaign(
 
 def _carried_out(spec: Spec, jobs: int) -> _Part:
     planned = plan(spec)
-    with tempfile.TemporaryDirectory(prefix="aftbed-bench-") as folder:
+    with scratch_directory("aftbed-bench-") as folder:
         began_s, began_cpu_s = time.monotonic(), _cpu_s()
-        asked = runner.CampaignRunOptions(Path(folder) / "campaign", jobs)
+        asked = runner.CampaignRunOptions(folder / "campaign", jobs)
         results = list(runner.run(planned, asked))
         seconds, cpu_s = time.monotonic() - began_s, _cpu_s() - began_cpu_s
     if len(results) != spec.stop.experiments:
@@ -140,7 +141,7 @@ def forks_ms(processes: int, times: int, jobs: int) -> float:
 
 
 def _fork_worker(parent: int, processes: int, times: int) -> int:
-    pid = os.fork()
+    pid = interrupts.fork()
     if pid:
         return pid
     code = 1

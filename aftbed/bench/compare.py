@@ -23,7 +23,6 @@ the interval says how large it can be.
 import math
 import os
 import shlex
-import tempfile
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -36,6 +35,8 @@ from aftbed.bench.rounds import ROUNDS, Meanwhile, in_turn, text
 from aftbed.bench.runs import TRIES, CommandFailedError, Log, run_python
 from aftbed.campaign.statistics import CONFIDENCE, Interval, quantile, quantile_interval
 from aftbed.core.errors import ConfigError, HarnessError, unknown
+from aftbed.core.progress import Show, unshown
+from aftbed.runtime.unix.interrupts import scratch_directory
 
 DEFAULT: Final = ("cycle --ftm pbr --requests 1100",)
 VERSION_SECONDS_MAX: Final = 60.0
@@ -122,6 +123,7 @@ def bench_compare(
     old_options: str = "",
     new_options: str = "",
     measure: Measure | None = None,
+    show: Show = unshown,
 ) -> VersionComparison:
     """Measure `benches` (words behind `aftbed bench`) of both, `rounds` times. Raises ConfigError.
 
@@ -146,8 +148,14 @@ def bench_compare(
         log(f"{venv}: aftbed bench {words}, round {number + 1} of {rounds}")
         return (measure or measured)(venv, words)
 
-    for bench in dict.fromkeys(benches):
-        found = in_turn(rounds, partial(document, sides[1], bench), partial(document, sides[0], bench), 0)
+    different = list(dict.fromkeys(benches))
+    for number, bench in enumerate(different):
+
+        def shown_of_all(done: float, of: float, before: int = number) -> None:
+            show(before * of + done, len(different) * of)
+
+        of_old, of_new = (partial(document, side, bench) for side in sides)
+        found = in_turn(rounds, of_new, of_old, 0, show=shown_of_all)
         machine[bench] = found.machine
         for figure in FIGURES[shlex.split(bench)[0]]:
             of_figure = _changes(bench, figure, found.limits, found.figures)
@@ -227,9 +235,9 @@ def _python_of(venv: Path, arguments: list[str], seconds_max: float) -> bytes:
     """The output of `aftbed arguments` of that version, and no other: whatever this process imports from."""
     python = str((venv / "bin" / "python").absolute())
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
-    with tempfile.TemporaryDirectory(prefix="aftbed-bench-") as folder:
+    with scratch_directory("aftbed-bench-") as folder:
         words = ["-P", "-m", "aftbed", *arguments]
-        return run_python(words, seconds_max, python=python, folder=folder, environment=environment)
+        return run_python(words, seconds_max, python=python, folder=str(folder), environment=environment)
 
 
 def _last_line(error: CommandFailedError) -> str:

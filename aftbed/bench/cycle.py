@@ -64,12 +64,13 @@ from aftbed.core.errors import HarnessError
 from aftbed.core.events import Event
 from aftbed.core.graph import Graph
 from aftbed.core.messages import PACKET_BYTES_MAX
+from aftbed.core.progress import Show, unshown
 from aftbed.ftm.compose import build, path
 from aftbed.ftm.registry import BRICKS
 from aftbed.functions.request_file import GivenRequests
 from aftbed.functions.source import is_foreign
 from aftbed.judge.record import RunRecord
-from aftbed.runtime.unix import linux
+from aftbed.runtime.unix import interrupts, linux
 from aftbed.vehicle.aeb.function import sample_requests
 
 WARM_UP: Final = 200  # requests, and turns of the ring
@@ -103,6 +104,7 @@ def bench_cycle(
     rounds: int = ROUNDS,
     application: str = "",
     given: GivenRequests | None = None,
+    show: Show = unshown,
 ) -> CycleResult:
     """`count` requests in rounds with the ring; of a function of the user, and what it is sent, if given."""
     shape = ring_of(build(ftm, placement))
@@ -116,7 +118,7 @@ def bench_cycle(
         )
         return latencies_us(run, skip=WARM_UP)
 
-    found = in_turn(len(share), cycle, lambda number: ring_us(shape, size, share[number], pin=pin))
+    found = in_turn(len(share), cycle, lambda number: ring_us(shape, size, share[number], pin=pin), show=show)
     cycles, ring = ([us for one in values for us in one] for values in (found.figures, found.limits))
     beside = beside_limit(shape.name, found.figures, found.limits, 1)
     medians = [
@@ -262,7 +264,7 @@ def _forked(
     serve: Callable[[], None],
 ) -> int:
     """Fork a process of the ring, which keeps only its own ends and dies with `parent`."""
-    child = os.fork()
+    child = interrupts.fork()
     if child:
         return child
     try:

@@ -23,6 +23,7 @@ from aftbed.bench.rounds import Ratio
 from aftbed.bench.runs import Log, run_python, tried
 from aftbed.campaign.ledger import Environment, here
 from aftbed.core.errors import ConfigError
+from aftbed.core.progress import Show, unshown
 from aftbed.runtime.unix.code_version import code_version
 
 COMMAND_SECONDS_MAX: Final = 1200.0
@@ -205,13 +206,22 @@ class Numbers(msgspec.Struct, frozen=True):
     numbers: tuple[Number, ...]
 
 
-def bench_all(log: Log, *, quick: bool = False, measure: Callable[[str], Document] | None = None) -> Numbers:
+def bench_all(
+    log: Log,
+    *,
+    quick: bool = False,
+    measure: Callable[[str], Document] | None = None,
+    show: Show = unshown,
+) -> Numbers:
     """Measure every line; `log` gets each command. Raises HarnessError if one fails again and again."""
     began_s = time.monotonic()
     run = measure or _measured
     commands = dict.fromkeys(line.command for line in LINES)
     words = {one: f"{one} {QUICK.get(one.split()[0], '')}".strip() if quick else one for one in commands}
-    found = {one: tried(f"aftbed bench {words[one]}", partial(run, words[one]), log) for one in words}
+    found: dict[str, Document] = {}
+    for one, command in words.items():
+        show(len(found), len(words))
+        found[one] = tried(f"aftbed bench {command}", partial(run, command), log)
     return Numbers(
         datetime.datetime.now(datetime.UTC).date().isoformat(),
         code_version(),

@@ -47,6 +47,7 @@ from aftbed.bench.sweep import PLACEMENT, StateResult, sized, sweep_sizes
 from aftbed.campaign.ledger import Environment, here
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.graph import PLACEMENTS
+from aftbed.core.progress import Show, unshown
 from aftbed.core.script import RECIPES
 from aftbed.report import plots
 from aftbed.report.plots import milliseconds
@@ -252,10 +253,10 @@ QUICK: Final = Effort(
 )
 
 
-def bench_paper(effort: Effort, log: Log) -> Paper:
+def bench_paper(effort: Effort, log: Log, show: Show = unshown) -> Paper:
     """Measure everything; `log` gets the name of each measurement. Raises HarnessError."""
     began = time.monotonic()
-    bench = _Measurements(effort, log)
+    bench = _Measurements(effort, log, show)
     cycles = {ftm: bench.cycle(ftm, PLACEMENT) for ftm in CYCLES}
     figures = [*bench.launch(), *map(_cycle_figure, cycles.values())]
     figures += [*bench.recoveries(), *bench.adaptations()]
@@ -281,11 +282,23 @@ def bench_paper(effort: Effort, log: Log) -> Paper:
 
 
 class _Measurements:
-    def __init__(self, effort: Effort, log: Log) -> None:
-        self._effort, self._log = effort, log
+    def __init__(self, effort: Effort, log: Log, show: Show) -> None:
+        self._effort, self._log, self._show = effort, log, show
+        self._done = 0
+        of_cycles = len(CYCLES) + len(PLACEMENTS) - 1
+        of_sizes = len(STATE_FTMS) * len(effort.sizes_bytes)
+        of_loads = len(LOAD_PLACEMENTS) * len(effort.rates_hz)
+        others = 1 + len(STATE_FTMS) + 3 + bool(effort.recipe_runs) + len(PLACEMENTS) + 1
+        self.total = of_cycles + of_sizes + of_loads + others
 
     def _tried(self, what: str, measure: Callable[[], Found]) -> Found:
-        return tried(what, measure, self._log)
+        found = tried(what, measure, self._log)
+        self._count()
+        return found
+
+    def _count(self) -> None:
+        self._done += 1
+        self._show(self._done, self.total)
 
     def launch(self) -> list[Figure]:
         count = self._effort.launches
@@ -346,6 +359,7 @@ class _Measurements:
             blackouts.append(found.blackout_ms.p50)
             totals.append(found.total_ms.p50)
             ends["never served again"] += bool(found.stuck)
+        self._count()
         words = ", ".join(f"{count} {end}" for end, count in ends.items() if count) or "all served again"
         fate = f"{what}: {runs} runs: {words}."
         if not blackouts:
@@ -376,7 +390,10 @@ class _Measurements:
             what = f"state of {size_bytes} bytes under {ftm}"
             return self._tried(what, partial(sized, ftm, size_bytes, updates, seconds))
 
-        return sweep_sizes(ftm, self._effort.sizes_bytes, measure)
+        before = self._done
+        found = sweep_sizes(ftm, self._effort.sizes_bytes, measure)
+        self._done = before + len(found)  # not all of them were tried
+        return found
 
     def load(self, placement: str, rate_hz: float) -> LoadResult:
         what, seconds = f"{rate_hz:g} requests a second, placement {placement}", self._effort.load_seconds

@@ -22,11 +22,12 @@ from typing import Final, NamedTuple
 from aftbed.bench.rounds import ROUNDS, InRounds, become_node, beside_limit, cores, in_turn, shares
 from aftbed.bench.runs import POLL_SECONDS, Percentiles, endless_run, percentiles, wait_for
 from aftbed.core.errors import HarnessError
+from aftbed.core.progress import Show, unshown
 from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault
 from aftbed.judge.checks import failovers
-from aftbed.runtime.unix import control_client, linux
+from aftbed.runtime.unix import control_client, interrupts, linux
 
 REDUNDANCY_SECONDS_MAX: Final = 5.0
 PAUSE_SECONDS: Final = 0.02  # of undisturbed service between two kills
@@ -56,7 +57,7 @@ class _Recovery(NamedTuple):
 
 
 def bench_recovery(
-    ftm: str, placement: str, kills: int, *, pin: bool = True, rounds: int = ROUNDS
+    ftm: str, placement: str, kills: int, *, pin: bool = True, rounds: int = ROUNDS, show: Show = unshown
 ) -> RecoveryResult:
     """Kill the primary `kills` times. Raises HarnessError."""
     share = shares(kills, rounds)
@@ -64,6 +65,7 @@ def bench_recovery(
         len(share),
         lambda number: _recoveries(ftm, placement, share[number], pin=pin),
         lambda number: deaths_ms(share[number], pin=pin),
+        show=show,
     )
     recoveries = [one for values in found.figures for one in values]
     parts = {name: [one.parts_ms[n] for one in recoveries] for n, name in enumerate(PARTS)}
@@ -147,7 +149,7 @@ def death_ms(*, pin: bool = True) -> float:
 
 def _child(parent: int, work: Callable[[], None]) -> int:
     """Fork a process that does `work` and exits; it dies with `parent`."""
-    pid = os.fork()
+    pid = interrupts.fork()
     if pid == 0:
         try:
             linux.die_with(parent)

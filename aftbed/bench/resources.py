@@ -20,7 +20,6 @@ beside an interpreter that only imports typer. Each round starts all four once.
 
 import json
 import os
-import tempfile
 import time
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -43,9 +42,11 @@ from aftbed.bench.runs import (
 from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import HarnessError
 from aftbed.core.journal import EntryKind
+from aftbed.core.progress import Show, unshown
 from aftbed.judge.record import read_record
 from aftbed.runtime.unix import control_client, linux
 from aftbed.runtime.unix.control_client import ProcessRow, measured
+from aftbed.runtime.unix.interrupts import scratch_directory
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import CarRun
 
@@ -118,7 +119,7 @@ class MemoryResult(msgspec.Struct, frozen=True):
     machine: Meanwhile
 
 
-def bench_memory(ftm: str, placement: str) -> MemoryResult:
+def bench_memory(ftm: str, placement: str, show: Show = unshown) -> MemoryResult:
     """Memory of a car's drive, when it has settled; CPU of a run that is idle. Raises HarnessError."""
     watch = MachineWatch()
     options, listener = options_for(ftm=ftm, placement=placement, work=CarRun("free-drive", 1.0, "latch"))
@@ -131,6 +132,7 @@ def bench_memory(ftm: str, placement: str) -> MemoryResult:
     finally:
         launched.stop()
         finished(launched, STOPPED[:1])
+    show(1, 2)
     nodes = [row for row in rows if row.node]
     others: dict[str, MemoryOfOthers] = {}
     for row in rows:
@@ -269,7 +271,7 @@ class _Start(NamedTuple):
     help_ms: float
 
 
-def bench_launch(ftm: str, placement: str, runs: int) -> LaunchResult:
+def bench_launch(ftm: str, placement: str, runs: int, show: Show = unshown) -> LaunchResult:
     """Start `aftbed run` and its help page so many times, a round each. Raises HarnessError."""
 
     def start(number: int) -> _Start:
@@ -278,7 +280,7 @@ def bench_launch(ftm: str, placement: str, runs: int) -> LaunchResult:
     def limits(number: int) -> tuple[float, float]:
         return _python_ms("-c", IMPORTS), _python_ms("-c", HELP_IMPORTS)
 
-    found = in_turn(runs, start, limits)
+    found = in_turn(runs, start, limits, show=show)
     launches, graphs, helps = ([one[n] for one in found.figures] for n in range(3))
     imports, typers = ([one[n] for one in found.limits] for n in range(2))
     beside = beside_limit("import of its libraries", _alone(launches), _alone(imports))
@@ -308,8 +310,8 @@ def _start_time(values: list[float]) -> StartTime:
 
 def _launched_ms(ftm: str, placement: str) -> tuple[float, float]:
     """To the first reply, and of the graph alone."""
-    with tempfile.TemporaryDirectory(prefix="aftbed-bench-") as folder:
-        directory = Path(folder) / "record"
+    with scratch_directory("aftbed-bench-") as folder:
+        directory = folder / "record"
         began_ns = time.monotonic_ns()
         arguments = ["-m", "aftbed", "run", "--ftm", ftm, "--placement", placement, "--pace", "max"]
         run_python(

@@ -30,7 +30,8 @@ import msgspec
 from aftbed.bench.runs import Percentiles, percentiles
 from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import ConfigError, HarnessError
-from aftbed.runtime.unix import linux
+from aftbed.core.progress import Show, unshown
+from aftbed.runtime.unix import interrupts, linux
 
 ROUNDS: Final = 11  # fewer are too few to quote
 DIGITS: Final = 3  # of a ratio
@@ -57,11 +58,13 @@ def in_turn(
     figure: Callable[[int], Figure],
     limit: Callable[[int], Limit],
     failures_max: int = FAILURES_MAX,
+    show: Show = unshown,
 ) -> Rounds[Figure, Limit]:
     """Measure both `rounds` times, the limit first in round 0, the figure first in round 1, and so on.
 
-    Both get the number of the round. One that fails is measured again, in all at most `failures_max` times: a
-    busy machine may fail it (`runs.tried`). Raises the HarnessError or ConfigError of the next failure.
+    Both get the number of the round. `show` is called between two measurements, with their number. One that
+    fails is measured again, in all at most `failures_max` times: a busy machine may fail it (`runs.tried`).
+    Raises the HarnessError or ConfigError of the next failure.
     """
     watch = MachineWatch()
     figures: list[Figure] = []
@@ -75,10 +78,12 @@ def in_turn(
                 into.append(what(number))
             except (HarnessError, ConfigError):
                 failures += 1
-                if failures > failures_max:
+                if failures > failures_max or interrupts.came():
                     raise
         watch.look()
+        show(len(figures) + len(limits), 2 * rounds)
 
+    show(0, 2 * rounds)
     for number in range(rounds):
         if number % 2 == 0:
             measure(number, limit, limits)

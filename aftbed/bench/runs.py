@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -17,7 +18,7 @@ from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.events import Event
 from aftbed.functions.request_file import GivenRequests
 from aftbed.judge.record import RunRecord, read_record
-from aftbed.runtime.unix import control_client, linux
+from aftbed.runtime.unix import control_client, interrupts, linux
 from aftbed.runtime.unix.launch import Launched, launch, options_for
 from aftbed.runtime.unix.options import LoadRun
 
@@ -27,6 +28,7 @@ POLL_SECONDS: Final = 0.005
 PAUSE_SECONDS: Final = 0.05  # of undisturbed service, between two things that are measured
 STOPPED: Final = ("interrupted", "")  # how an endless run may end
 TRIES: Final = 3
+CHILD_END_SECONDS_MAX: Final = 0.7  # of a command that is interrupted; then its warden cleans up
 
 Log = Callable[[str], None]
 Found = TypeVar("Found")
@@ -54,6 +56,8 @@ def tried(what: str, measure: Callable[[], Found], log: Log) -> Found:
         try:
             return measure()
         except (HarnessError, ConfigError) as error:  # a run that died refuses like one that never was
+            if interrupts.came():
+                raise
             reason = str(error)
     raise HarnessError(f"{what}: failed {TRIES} times, the last time: {reason}")
 
@@ -79,23 +83,45 @@ def run_python(
     Raises CommandFailedError on a failure, HarnessError on a timeout.
     """
     command = " ".join(["python", *arguments])
+    with contextlib.ExitStack() as standing:
+        with interrupts.uninterrupted():
+            child = standing.enter_context(
+                subprocess.Popen(
+                    [python, *arguments],
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.PIPE,
+                    cwd=folder,
+                    env=environment,
+                    preexec_fn=partial(_begin, os.getpid()),  # noqa: PLW1509 - a bench has no threads
+                )
+            )
+            standing.callback(_end, child)
+        try:
+            out, err = child.communicate(timeout=seconds_max)
+        except subprocess.TimeoutExpired:
+            raise HarnessError(f"{command}: not ended after {seconds_max:g} s") from None
+    if child.returncode != 0:
+        raise CommandFailedError(command, child.returncode, err.decode(errors="replace")[-500:].strip())
+    return out
+
+
+def _begin(parent: int) -> None:
+    """In the child: die with the bench, and receive its interrupts."""
+    linux.die_with(parent)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+def _end(child: "subprocess.Popen[bytes]") -> None:
+    """Let a command that has not ended clean up as behind Ctrl-C; kill it if it takes too long."""
+    if child.poll() is not None:
+        return
+    child.send_signal(signal.SIGINT)
     try:
-        done = subprocess.run(
-            [python, *arguments],
-            capture_output=True,
-            timeout=seconds_max,
-            check=False,
-            cwd=folder,
-            env=environment,
-            preexec_fn=partial(linux.die_with, os.getpid()),
-        )
+        child.wait(CHILD_END_SECONDS_MAX)
     except subprocess.TimeoutExpired:
-        raise HarnessError(f"{command}: not ended after {seconds_max:g} s") from None
-    if done.returncode != 0:
-        raise CommandFailedError(
-            command, done.returncode, done.stderr.decode(errors="replace")[-500:].strip()
-        )
-    return done.stdout
+        pass
+    finally:
+        child.kill()
 
 
 # -- runs -----------------------------------------------------------------------------------------
@@ -131,9 +157,19 @@ def endless_run(ftm: str, placement: str, rate_hz: float = 0.0, *, pin: bool = T
     run = EndlessRun(launched.private)
     try:
         yield run
-    finally:
+    except KeyboardInterrupt:  # its record does not matter, nor why it ended
         launched.stop()
-        run.record = finished(launched, STOPPED)
+        try:
+            _follow(launched)
+        finally:
+            launched.remove()
+        raise
+    except BaseException:
+        launched.stop()
+        finished(launched, STOPPED)
+        raise
+    launched.stop()
+    run.record = finished(launched, STOPPED)
 
 
 def _start(
@@ -150,12 +186,16 @@ def _start(
     return launch(options, listener, given)
 
 
+def _follow(launched: Launched) -> None:
+    for _ in launched.reports():
+        pass
+    launched.wait()
+
+
 def finished(launched: Launched, ends: tuple[str, ...]) -> RunRecord:
     """Follow the run to its end; its record. Raises HarnessError if it ended for another reason."""
     try:
-        for _ in launched.reports():
-            pass
-        launched.wait()
+        _follow(launched)
         record = read_record(launched.record, in_memory=True)
         if record.end is None or record.end.reason not in ends:
             reason = "the supervisor died" if record.end is None else record.end.reason

@@ -17,6 +17,7 @@ from aftbed.bench.rounds import ROUNDS, InRounds, beside_limit, in_turn, shares
 from aftbed.bench.runs import Percentiles, percentiles
 from aftbed.core.errors import HarnessError
 from aftbed.core.journal import EntryKind
+from aftbed.core.progress import Show, unshown
 from aftbed.runtime.sim.world import Setup, simulate
 
 COUNTED: Final = 100  # requests more in the second of two runs whose calls are counted
@@ -36,7 +37,9 @@ class SimulatorResult(InRounds, frozen=True):
     requests_per_s: int
 
 
-def bench_simulator(ftm: str, placement: str, requests: int, *, rounds: int = ROUNDS) -> SimulatorResult:
+def bench_simulator(
+    ftm: str, placement: str, requests: int, *, rounds: int = ROUNDS, show: Show = unshown
+) -> SimulatorResult:
     """Simulate `requests` requests, over all rounds. Raises ConfigError."""
     share = shares(requests, rounds)
     setup = Setup(ftm, placement)
@@ -45,6 +48,7 @@ def bench_simulator(ftm: str, placement: str, requests: int, *, rounds: int = RO
         len(share),
         lambda number: _request_us(setup, share[number]),
         lambda number: _calls_us(round(calls * share[number])) / share[number],
+        show=show,
     )
     beside = beside_limit(
         f"{calls:g} calls of an empty function", [[us] for us in found.figures], [[us] for us in found.limits]

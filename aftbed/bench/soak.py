@@ -21,7 +21,6 @@ import contextlib
 import os
 import resource
 import select
-import tempfile
 import time
 from bisect import bisect_left
 from collections import Counter, defaultdict
@@ -40,6 +39,7 @@ from aftbed.core.events import Event
 from aftbed.core.graph import PLACEMENTS, Graph
 from aftbed.core.journal import EntryKind, History
 from aftbed.core.messages import Goal
+from aftbed.core.progress import Show, unshown
 from aftbed.ftm.compose import DUPLEX_EXPRESSIONS
 from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Trigger
@@ -50,6 +50,7 @@ from aftbed.judge.record import read_record
 from aftbed.judge.verdict import Verdict, Word, judge
 from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.control_client import ProcessRow
+from aftbed.runtime.unix.interrupts import scratch_directory
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import LoadRun
 
@@ -61,6 +62,7 @@ REQUESTS_MAX: Final = 100_000_000
 RATE_HZ_MAX: Final = 5000.0
 MINUTES_MIN: Final = 0.05
 EVERY_SECONDS_MIN: Final = 0.1
+SHOW_SECONDS: Final = 1.0  # between two looks at the time, if nothing happens
 SAMPLE_SECONDS: Final = 5.0  # between samples, where there are no adaptations
 DESCRIPTORS_OF_SPARE: Final = 2  # in the supervisor: its control line and its pidfd
 VALUES_MIN: Final = 8  # for the interval: of fewer, Kendall's tau is not normally distributed
@@ -194,13 +196,14 @@ def check(plan: SoakPlan) -> None:
             raise ConfigError(f"{option} {seconds:g}: 0 (none), or {least_s:g} to {most_s:g} s is allowed")
 
 
-def bench_soak(plan: SoakPlan, log: Log) -> SoakResult:
-    """Run for so long, and judge. Raises HarnessError where something was not dealt with in time."""
+def bench_soak(plan: SoakPlan, log: Log, show: Show = unshown) -> SoakResult:
+    """Run for so long, and judge; `show` gets the seconds.
+
+    Raises HarnessError where something was not dealt with in time.
+    """
     with contextlib.ExitStack() as standing:
-        folder = plan.record or str(
-            Path(standing.enter_context(tempfile.TemporaryDirectory(prefix="aftbed-bench-"))) / "record"
-        )
-        soak = Soak(plan, folder, log)
+        folder = plan.record or str(standing.enter_context(scratch_directory("aftbed-bench-")) / "record")
+        soak = Soak(plan, folder, log, show)
         standing.callback(soak.launched.remove)
         soak.run()
         log("judging the record")
@@ -215,8 +218,8 @@ def bench_soak(plan: SoakPlan, log: Log) -> SoakResult:
 class Soak:
     """One run, from its launch to its end."""
 
-    def __init__(self, plan: SoakPlan, folder: str, log: Log) -> None:
-        self.plan, self._log = plan, log
+    def __init__(self, plan: SoakPlan, folder: str, log: Log, show: Show = unshown) -> None:
+        self.plan, self._log, self._show = plan, log, show
         load = LoadRun(max(1, round(plan.minutes * 60 * plan.rate_hz)), plan.rate_hz)
         first = DUPLEX_EXPRESSIONS[0]
         options, listener = options_for(ftm=first, placement=plan.placement, work=load, record=folder)
@@ -227,6 +230,7 @@ class Soak:
         self._asked = 0  # adaptations
         self._reports = self.launched.reports()
         self._ended = False
+        self._began_s = time.monotonic()
 
     @property
     def tour(self) -> int:
@@ -237,7 +241,7 @@ class Soak:
         """To its end."""
         plan = self.plan
         self._settle()
-        began_s = time.monotonic()
+        began_s = self._began_s = time.monotonic()
         end_s = began_s + plan.minutes * 60 - LAST_SECONDS
         begin = {"crash": self._crash, "adapt": self._adapt, "sample": self._sample}
         try:
@@ -262,7 +266,9 @@ class Soak:
         poll = select.poll()
         poll.register(self.launched.line.fileno(), select.POLLIN)
         while not self._ended and (left_s := limit_s - time.monotonic()) > 0:
-            if poll.poll(left_s * 1e3) and next(self._reports, None) is None:
+            seconds = self.plan.minutes * 60
+            self._show(min(time.monotonic() - self._began_s, seconds), seconds)
+            if poll.poll(min(left_s, SHOW_SECONDS) * 1e3) and next(self._reports, None) is None:
                 self._ended = True
 
     def _settle(self) -> None:

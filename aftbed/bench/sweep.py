@@ -42,6 +42,7 @@ from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.events import Event
 from aftbed.core.messages import PACKET_BYTES_MAX, Goal
+from aftbed.core.progress import Show, unshown
 from aftbed.ftm.compose import build, path
 from aftbed.ftm.pages import PAGE_BYTES
 from aftbed.ftm.registry import BRICKS
@@ -102,7 +103,13 @@ class StateRatio(InRounds, frozen=True):
 
 
 def bench_state(
-    ftm: str, size_bytes: int, beside_bytes: int, *, tracked: bool = False, rounds: int = ROUNDS
+    ftm: str,
+    size_bytes: int,
+    beside_bytes: int,
+    *,
+    tracked: bool = False,
+    rounds: int = ROUNDS,
+    show: Show = unshown,
 ) -> StateRatio:
     """A function of each size in turn: its cycle in a closed loop, and the blackout of updates to it.
 
@@ -123,7 +130,7 @@ def bench_state(
     def limit(number: int) -> list[float]:
         return ring_us(shape, RING_BYTES, RING_COUNT, warm_up=RING_WARM_UP, work=work)
 
-    found = in_turn(rounds, both, limit)
+    found = in_turn(rounds, both, limit, show=show)
     small, large = ([one[n] for one in found.figures] for n in range(2))
     beside_cycles, cycles = ([us for one in windows for us in one.cycles_us] for windows in (small, large))
     beside_blackout, blackout = (

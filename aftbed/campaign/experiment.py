@@ -6,6 +6,7 @@ execution, a refused adaptation. `inconclusive` and `harness_error` are not abou
 a pass (G8).
 """
 
+import itertools
 import shlex
 import time
 from collections.abc import Callable, Iterable
@@ -22,6 +23,7 @@ from aftbed.campaign.states import RunState, states_of
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Scheduled
+from aftbed.core.progress import Show, unshown
 from aftbed.core.script import RECIPES
 from aftbed.core.units import duration
 from aftbed.ftm.compose import build, detects
@@ -459,12 +461,18 @@ def _longest(times: Iterable[float | None]) -> float | None:
 # -- the smallest experiment with the same outcome ------------------------------------------------
 
 
-def smallest(result: Result) -> Experiment:
-    """In the simulator. Raises ConfigError where the experiment does not come to the same there."""
+def smallest(result: Result, show: Show = unshown) -> Experiment:
+    """In the simulator; `show` gets how many runs were tried.
+
+    Raises ConfigError where the experiment does not come to the same there.
+    """
     first = msgspec.structs.replace(result.experiment, runtime="sim")
     setup = setup_of(first)
 
+    tries = itertools.count(1)
+
     def same(simpler: Setup) -> tuple[Breach, ...]:
+        show(next(tries), 0)
         found = carry_out(_as(first, simpler), lambda _: None, NO_CODE)
         return (Breach(found.outcome, "; ".join(found.reasons)),) if found.outcome == result.outcome else ()
 

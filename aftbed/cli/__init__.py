@@ -15,7 +15,9 @@ import sys
 from collections.abc import Iterator
 from typing import Final, TextIO
 
+from aftbed.cli.interrupted import interrupted
 from aftbed.core.errors import ConfigError, HarnessError, PeerError, shown
+from aftbed.runtime.unix import interrupts
 
 EXIT_USAGE: Final = 2
 EXIT_TROUBLE: Final = 3
@@ -26,19 +28,24 @@ STREAMS: Final = (("stdin", "r"), ("stdout", "w"), ("stderr", "w"))  # by descri
 
 def main() -> None:
     """The console script `aftbed`."""
-    _prepare()
     fresh = "typer" not in sys.modules  # this interpreter has been started for this command
-    if fresh:  # what is imported stays; to look for garbage in it takes a tenth of the time
-        gc.disable()  # until the command has been imported: see `lazy`
     try:
+        _prepare()
+        if fresh:  # what is imported stays; to look for garbage in it takes a tenth of the time
+            interrupts.listen()
+            gc.disable()  # until the command has been imported: see `lazy`
         with _head_start(sys.argv[1:]) if fresh else contextlib.nullcontext():
             code = _call()
     except ConfigError as error:
-        code = _explain(EXIT_USAGE, f"error: {error}")
-    except (HarnessError, PeerError) as error:
-        code = _explain(EXIT_TROUBLE, f"trouble: {error}")
+        code = interrupted() if interrupts.came() else _explain(EXIT_USAGE, f"error: {error}")
+    except (HarnessError, PeerError) as error:  # a run that was cut short is no trouble
+        code = interrupted() if interrupts.came() else _explain(EXIT_TROUBLE, f"trouble: {error}")
     except OSError as error:
-        code = _failed(error)
+        code = interrupted() if interrupts.came() else _failed(error)
+    except KeyboardInterrupt:  # outside of a command, or once more while it cleaned up
+        code = interrupted()
+    if fresh and interrupts.came():
+        interrupts.ignore()  # nothing is left that it could end
     for stream in (sys.stdout, sys.stderr):
         if not _taken(stream):  # the interpreter would try again at its end, and complain
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
@@ -102,6 +109,8 @@ def _call() -> int:
         if isinstance(ended.__context__, BrokenPipeError):  # typer makes code 1 of it, and replaces streams
             sys.stdout, sys.stderr = streams
             raise ended.__context__ from None
+        if isinstance(getattr(ended.__context__, "__cause__", None), KeyboardInterrupt):  # code 130 of typer
+            interrupted()
         code = ended.code
     sys.stdout.flush()
     return code if isinstance(code, int) else 0

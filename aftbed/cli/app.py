@@ -9,6 +9,7 @@ from aftbed.cli.lazy import CommandTable, group_of
 COMMANDS: Final[CommandTable] = {
     "run": ("run:run", "Drive a car at an obstacle, under a fault tolerance mechanism; end with a verdict."),
     "check": ("check:check", "Judge a recorded run again."),
+    "list": ("runs:list_", "The runs that live, and the records of runs: mechanism, scenario, age, verdict."),
     "status": ("live:status", "Show the state of a live run."),
     "ps": ("live:ps", "The processes of a live run: name, role, pid, CPU, memory (PSS)."),
     "graph": ("live:graph", "The bricks, their channels and their nodes."),

@@ -4,7 +4,6 @@ The processes that are measured are forked from this one. So what only some figu
 imported where it is used.
 """
 
-import sys
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -16,22 +15,22 @@ from aftbed.bench.cycle import bench_cycle, bench_hops
 from aftbed.bench.recovery import bench_recovery
 from aftbed.bench.resources import bench_launch, bench_memory
 from aftbed.bench.rounds import ROUNDS, text
-from aftbed.cli.options import App, Ftm, Recipe, check_range, print_json
+from aftbed.cli.interrupted import told_if_interrupted
+from aftbed.cli.options import App, Ftm, Json, Recipe, check_range, print_json
 from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError
 from aftbed.ftm.compose import DUPLEX, replication_of
 from aftbed.functions.load import OWN_CODE
 from aftbed.functions.request_file import located_requests, requests_from
 from aftbed.functions.source import located
+from aftbed.report.progress import ProgressLine
 
 bench = typer.Typer(cls=PlainGroup)
 REQUESTS_MIN: Final = 5000
 SENT_FUNCTION: Final = 512  # requests of MODULE:FUNCTION, sent in turn
 KILLS_MIN: Final = 1
-PROGRESS: Final = "  measuring: "
 
 Placement = Annotated[str, typer.Option(help="process, replica or single.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]
 Rounds = Annotated[
     int, typer.Option(min=1, help=f"Of figure and limit in turn; below {ROUNDS} they are too few to quote.")
 ]
@@ -55,9 +54,17 @@ def cycle(
     application, given = located(app) if app is not None else "", None
     if sent is not None:
         given = requests_from(located_requests(sent), SENT_FUNCTION, 0, OWN_CODE)
-    result = bench_cycle(
-        ftm, placement, requests, pin=pin, rounds=rounds, application=application, given=given
-    )
+    with _measuring("cycle", as_json=json) as progress:
+        result = bench_cycle(
+            ftm,
+            placement,
+            requests,
+            pin=pin,
+            rounds=rounds,
+            application=application,
+            given=given,
+            show=progress.show,
+        )
     _print(result, as_json=json)
 
 
@@ -79,7 +86,9 @@ def recovery(
         raise ConfigError(
             "--placement single: both replicas die with their node; process and replica are allowed"
         )
-    _print(bench_recovery(ftm, placement, kills, pin=pin, rounds=rounds), as_json=json)
+    with _measuring("recovery", as_json=json) as progress:
+        found = bench_recovery(ftm, placement, kills, pin=pin, rounds=rounds, show=progress.show)
+    _print(found, as_json=json)
 
 
 @bench.command()
@@ -94,7 +103,11 @@ def adapt(
     json: Json = False,
 ) -> None:
     """Adaptations there and back under load: the blackout at the client, and what is lost."""
-    _print(bench_adapt(old, new, placement, recipe, adaptations, pin=pin, rounds=rounds), as_json=json)
+    with _measuring("adapt", as_json=json) as progress:
+        found = bench_adapt(
+            old, new, placement, recipe, adaptations, pin=pin, rounds=rounds, show=progress.show
+        )
+    _print(found, as_json=json)
 
 
 @bench.command()
@@ -105,13 +118,32 @@ def launch(
     json: Json = False,
 ) -> None:
     """From the start of `aftbed run` to the first reply, the graph alone, and the page of --help."""
-    _print(bench_launch(ftm, placement, runs), as_json=json)
+    with _measuring("launch", as_json=json) as progress:
+        found = bench_launch(ftm, placement, runs, progress.show)
+    _print(found, as_json=json)
+
+
+@bench.command()
+def page(
+    ftm: Ftm = "pbr",
+    placement: Placement = "process",
+    seconds: Annotated[float, typer.Option(min=0.1, help="Of each round, with a page and without.")] = 1.0,
+    pin: Pin = True,
+    rounds: Rounds = ROUNDS,
+    json: Json = False,
+) -> None:
+    """Cycle time at the client while a live page reads the run, alternating with runs without a page."""
+    from aftbed.bench.page import bench_page  # noqa: PLC0415 - see above
+
+    _print(bench_page(ftm, placement, seconds, pin=pin, rounds=rounds), as_json=json)
 
 
 @bench.command()
 def memory(ftm: Ftm = "pbr", placement: Placement = "process", json: Json = False) -> None:
     """PSS and RSS of the graph's processes, and of all others apart."""
-    _print(bench_memory(ftm, placement), as_json=json)
+    with _measuring("memory", as_json=json) as progress:
+        found = bench_memory(ftm, placement, progress.show)
+    _print(found, as_json=json)
 
 
 @bench.command()
@@ -128,7 +160,9 @@ def campaign(
     from aftbed.bench.campaign import bench_campaign  # noqa: PLC0415 - see above
 
     runtime: Literal["unix", "sim"] = "sim" if sim else "unix"
-    _print(bench_campaign(ftm, placement, runtime, experiments, jobs, rounds=rounds), as_json=json)
+    with _measuring("campaign", as_json=json) as progress:
+        found = bench_campaign(ftm, placement, runtime, experiments, jobs, rounds=rounds, show=progress.show)
+    _print(found, as_json=json)
 
 
 @bench.command()
@@ -142,7 +176,9 @@ def simulator(
     """Requests per second of one core in the simulator, beside a bare loop of as many calls."""
     from aftbed.bench.simulator import bench_simulator  # noqa: PLC0415 - see above
 
-    _print(bench_simulator(ftm, placement, requests, rounds=rounds), as_json=json)
+    with _measuring("simulator", as_json=json) as progress:
+        found = bench_simulator(ftm, placement, requests, rounds=rounds, show=progress.show)
+    _print(found, as_json=json)
 
 
 @bench.command()
@@ -162,7 +198,9 @@ def state(
 
     check_range("--bytes", size, SIZE_BYTES_MIN, SIZE_BYTES_MAX)
     check_range("--beside", beside, SIZE_BYTES_MIN, SIZE_BYTES_MAX)
-    _print(bench_state(ftm, size, beside, tracked=tells_changes, rounds=rounds), as_json=json)
+    with _measuring("state", as_json=json) as progress:
+        found = bench_state(ftm, size, beside, tracked=tells_changes, rounds=rounds, show=progress.show)
+    _print(found, as_json=json)
 
 
 @bench.command()
@@ -173,7 +211,8 @@ def hops(
     json: Json = False,
 ) -> None:
     """The delay of one hop between two bricks in processes of their own, as a distribution."""
-    found = bench_hops(ftm, requests, pin=pin)
+    with _measuring("hops", as_json=json):
+        found = bench_hops(ftm, requests, pin=pin)
     if json:
         _print(found, as_json=True)
         return
@@ -207,7 +246,9 @@ def soak(
 
     plan = endurance.SoakPlan(minutes, rate, crash_every, adapt_every, placement, record)
     endurance.check(plan)
-    found = endurance.bench_soak(plan, _show_progress)
+    kept = f"the record is kept in {record}" if record is not None else "nothing is kept"
+    with told_if_interrupted(lambda: kept), _measuring("soak", "s", as_json=json) as progress:
+        found = endurance.bench_soak(plan, progress.step, progress.show)
     if json:
         print_json(found)
     else:
@@ -228,7 +269,8 @@ def every(
 
     if into is not None:
         numbers.check_page(into)
-    found = numbers.bench_all(_show_progress, quick=quick)
+    with _measuring("all", as_json=json) as progress:
+        found = numbers.bench_all(progress.step, quick=quick, show=progress.show)
     print(msgspec.json.encode(found).decode() if json else "\n".join(numbers.markdown(found)))
     if into is not None:
         numbers.write_into(into, found)
@@ -260,15 +302,17 @@ def compare(
     if max_ratio is not None and not 0 < max_ratio < float("inf"):
         raise ConfigError(f"--max-ratio {max_ratio:g}: more than 0 is allowed, 1.05 for 5 % slower")
     given = tuple(benches) if benches else versions.DEFAULT
-    found = versions.bench_compare(
-        old,
-        new,
-        given,
-        _show_progress,
-        rounds=rounds,
-        old_options=old_options,
-        new_options=new_options,
-    )
+    with _measuring("compare", as_json=json) as progress:
+        found = versions.bench_compare(
+            old,
+            new,
+            given,
+            progress.step,
+            rounds=rounds,
+            old_options=old_options,
+            new_options=new_options,
+            show=progress.show,
+        )
     if json:
         print_json(found)
     else:
@@ -293,7 +337,8 @@ def paper(
         raise ConfigError(f"--html {html}: {html.parent} is no directory")
     if html is not None and html.is_dir():
         raise ConfigError(f"--html {html}: a directory; the name of a file is allowed")
-    found = again.bench_paper(again.QUICK if quick else again.FULL, _show_progress)
+    with _measuring("paper", as_json=json) as progress:
+        found = again.bench_paper(again.QUICK if quick else again.FULL, progress.step, progress.show)
     if json:
         print_json(found)
     else:
@@ -303,8 +348,8 @@ def paper(
         html.write_text(again.html_page(found), encoding="utf-8")
 
 
-def _show_progress(what: str) -> None:
-    print(f"{PROGRESS}{what}", file=sys.stderr, flush=True)
+def _measuring(bench: str, unit: str = "measurements", *, as_json: bool) -> ProgressLine:
+    return ProgressLine(f"bench {bench}", unit=unit, plain=not as_json)
 
 
 def _print(document: msgspec.Struct, *, as_json: bool) -> None:

@@ -4,6 +4,7 @@ Statistics and reports need scipy and Jinja2 (0.4 s, 30 MB), so they are importe
 """
 
 import re
+import shlex
 import shutil
 import sys
 import time
@@ -11,7 +12,7 @@ from contextlib import closing
 from functools import partial
 from json import dumps
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import msgspec
 import typer
@@ -22,6 +23,7 @@ from aftbed.campaign.experiment import REQUESTS_MAX, Result, carry_out, refuse_u
 from aftbed.campaign.plan import CampaignPlan, size_of
 from aftbed.campaign.plan import plan as plan_of
 from aftbed.campaign.spec import EXPERIMENTS_MAX, Spec, check, read_spec, shipped
+from aftbed.cli.interrupted import interrupted
 from aftbed.cli.options import (
     App,
     Ftti,
@@ -40,9 +42,12 @@ from aftbed.functions.load import OWN_CODE
 from aftbed.functions.request_file import located_requests, requests_from
 from aftbed.functions.source import located
 from aftbed.interop.files import write_text_whole, write_whole
-from aftbed.judge.verdict import EXIT_INTERRUPTED
 from aftbed.report.export import write_csv, write_parquet
+from aftbed.report.progress import ProgressLine
 from aftbed.runtime.unix.trust import NOBODY, OWN_RUN, Trust, trusting
+
+if TYPE_CHECKING:
+    from aftbed.campaign.summary import Summary
 
 RUNTIMES: Final = ("unix", "sim")
 EXECUTORS: Final = ("local", "dask")
@@ -61,10 +66,14 @@ ExperimentName = Annotated[str, typer.Argument(help="Id of the experiment, its b
 
 
 @campaign.command("list")
-def list_() -> None:
+def list_(json: Json = False) -> None:
     """The campaigns that come with aftbed."""
-    for name in shipped():
-        print(f"{name:<14} {read_spec(name).about}")
+    found = {name: read_spec(name).about for name in shipped()}
+    if json:
+        print_json({"campaigns": [{"name": name, "about": about} for name, about in found.items()]})
+        return
+    for name, about in found.items():
+        print(f"{name:<14} {about}")
 
 
 @campaign.command()
@@ -211,18 +220,30 @@ def run(given: CampaignRunArguments) -> int:
         tried_out(system.app, first_requests(system.app, given_requests), force=False)
     from aftbed.report.terminal import CampaignProgress  # noqa: PLC0415 - scipy, after the options
 
-    began_s, interrupted = time.monotonic(), False
+    began_s = time.monotonic()
     results = runner.run(found, options)  # raises ConfigError here, before the progress is shown
     todo = sum(options.has(index, len(found.strata)) for index in range(found.size))
     try:
-        with closing(results), CampaignProgress(found.spec.campaign, todo, quiet=given.json) as progress:
+        with closing(results), CampaignProgress(found.spec.campaign, todo, plain=not given.json) as progress:
             for result in results:
                 progress.add(result)
     except KeyboardInterrupt:
-        print("interrupted: --resume goes on from here", file=sys.stderr)
-        interrupted = True
-    code = _judge(options.out, found.size, time.monotonic() - began_s, as_json=given.json)
-    return EXIT_INTERRUPTED if interrupted else code
+        return _interrupted(options.out, found.size, time.monotonic() - began_s, as_json=given.json)
+    return _judge(options.out, found.size, time.monotonic() - began_s, as_json=given.json)
+
+
+def _interrupted(folder: Path, size: int, seconds: float, *, as_json: bool) -> int:
+    """Say what is kept, then show what is known so far. Reports take seconds: the user may ask for them."""
+    from aftbed.campaign.summary import summarise  # noqa: PLC0415 - scipy
+
+    records = _ledger(folder)
+    words = sys.argv[1:] if "--resume" in sys.argv else [*sys.argv[1:], "--resume"]
+    go_on = shlex.join(("aftbed", *words))
+    reports = shlex.join(("aftbed", "campaign", "report", str(folder)))
+    kept = f"{len(records.results)} of {size} experiments are kept in {folder}"
+    code = interrupted(f"{kept}; go on: {go_on}; reports: {reports}")
+    _show(summarise(records, size, seconds), as_json=as_json)
+    return code
 
 
 def _run_options(found: CampaignPlan, given: CampaignRunArguments) -> runner.CampaignRunOptions:
@@ -250,18 +271,24 @@ def _judge(folder: Path, size: int, seconds: float, *, as_json: bool) -> int:
     """Summarise the ledger, of a campaign of `size` experiments, and write the reports; the exit code."""
     from aftbed.campaign.summary import summarise  # noqa: PLC0415
     from aftbed.report.documents import documents  # noqa: PLC0415 - scipy
-    from aftbed.report.terminal import summary_lines  # noqa: PLC0415
 
     records = _ledger(folder)
     summary = summarise(records, size, seconds)
     for name, text in documents(summary, records).items():
         write_text_whole(folder / name, text)
-    if as_json:
-        print(msgspec.json.encode(summary).decode())
-    else:
-        print("\n".join(summary_lines(summary)))
+    _show(summary, as_json=as_json)
+    if not as_json:
         print(f"records and reports: {folder}")
     return EXIT_CODES[summary.gate]
+
+
+def _show(summary: "Summary", *, as_json: bool) -> None:
+    from aftbed.report.terminal import summary_lines  # noqa: PLC0415 - scipy
+
+    if as_json:
+        print_json(summary)
+    else:
+        print("\n".join(summary_lines(summary)))
 
 
 # -- from the records -----------------------------------------------------------------------------
@@ -283,12 +310,16 @@ def _report(folder: Path, *, as_json: bool) -> int:
 def export(
     folder: Folder,
     out: Annotated[Path, typer.Option(help="A file: .csv, or .parquet (pip install 'aftbed[parquet]').")],
+    json: Json = False,
 ) -> None:
     """The results as a table, one row each."""
     writers = {".csv": write_csv, ".parquet": write_parquet}
     if out.suffix not in writers:
         raise unknown("kind of file", out.suffix, writers)
-    write_whole(out, partial(writers[out.suffix], _ledger(folder)))
+    records = _ledger(folder)
+    write_whole(out, partial(writers[out.suffix], records))
+    if json:
+        print_json({"file": str(out), "results": len(records.results)})
 
 
 @campaign.command()
@@ -353,10 +384,13 @@ def compare(
 
 
 @campaign.command()
-def assumptions(folder: Folder, trust: TrustedFolders = None) -> None:
+def assumptions(folder: Folder, trust: TrustedFolders = None, json: Json = False) -> None:
     """What each mechanism assumes, and the outcomes where that does not hold, as Markdown."""
-    from aftbed.campaign.assumptions import markdown  # noqa: PLC0415 - scipy
+    from aftbed.campaign.assumptions import cells, markdown  # noqa: PLC0415 - scipy
 
+    if json:
+        print_json({"cells": list(cells(_ledger(folder), trusting(trust)))})
+        return
     print(shown(markdown(_ledger(folder), trusting(trust))), end="")
 
 
@@ -374,7 +408,8 @@ def bundle(
     from aftbed.report.bundle import SUMS, archive_of, entries, sha256  # noqa: PLC0415 - scipy
 
     check_file("--out", out, ".zip")
-    made = entries([_ledger(folder) for folder in folders], trusting(trust))
+    with ProgressLine("campaign bundle", unit="runs", plain=not json) as progress:
+        made = entries([_ledger(folder) for folder in folders], trusting(trust), progress.show)
     data = archive_of(made)
     write_whole(out, lambda path: path.write_bytes(data))
     files = {name: sha256(entry.data) for name, entry in made.items() if name != SUMS}
@@ -392,7 +427,8 @@ def verify(file: BundleFile, json: Json = False) -> None:
     """
     from aftbed.report.bundle import verified  # noqa: PLC0415 - scipy
 
-    found = verified(file)
+    with ProgressLine("campaign verify", unit="files", plain=not json) as progress:
+        found = verified(file, progress.show)
     if json:
         print_json({"bundle": file.name} | asdict(found))
     else:
@@ -416,7 +452,8 @@ def argument(
     from aftbed.report.bundle import campaigns_in, verified  # noqa: PLC0415
 
     check_file("--plot", plot, ".svg")
-    checked = verified(file)
+    with ProgressLine("campaign argument", unit="files", plain=not json) as progress:
+        checked = verified(file, progress.show)
     if checked.misfits:
         for one in checked.misfits:
             print(shown(f"aftbed: {file}: {one.path}: {one.why}"), file=sys.stderr)
@@ -462,7 +499,8 @@ def shrink(folder: Folder, experiment: ExperimentName, json: Json = False) -> No
     A real experiment is shrunk in the simulator, too: there a run is repeated to the last event.
     """
     before = ledger.find(_ledger(folder), experiment)
-    found = smallest(before)
+    with ProgressLine("campaign shrink", unit="runs", plain=not json) as progress:
+        found = smallest(before, progress.show)
     if json:
         print_json(found)
     else:

@@ -1,8 +1,10 @@
 """`aftbed check`: judge the record of a run."""
 
+import contextlib
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import typer
 
 from aftbed.cli.options import Html, Json, Junit, Quiet, TrustedFolders, check_file
@@ -37,6 +39,14 @@ def judge_and_show(record: Path, trust: Trust, *, as_json: bool, quiet: bool = F
     verdict = judge(found, evidence_of(found, trust=trust))
     show_verdict(verdict, as_json=as_json, quiet=quiet)
     return verdict
+
+
+def keep_verdict(record: Path, verdict: Verdict) -> None:
+    """Leave the verdict in the record, for `aftbed list`; a full disk changes nothing else."""
+    from aftbed.judge.listed import VERDICT_NAME  # noqa: PLC0415 - of runs with --record
+
+    with contextlib.suppress(OSError):
+        (record / VERDICT_NAME).write_bytes(msgspec.json.encode(verdict))
 
 
 def write_junit(sink: Path, verdict: Verdict) -> list[str]:

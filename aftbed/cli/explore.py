@@ -11,15 +11,16 @@ import typer
 from msgspec.structs import replace
 
 from aftbed.cli.adapt import refuse_unsuitable
+from aftbed.cli.interrupted import interrupted
 from aftbed.cli.options import App, Json, check_range, jobs_of, note_unusable, print_json, separated, takes
 from aftbed.cli.parsing import PlainGroup
 from aftbed.cli.request_options import RequestSource, first_requests
 from aftbed.cli.sim import described, event_lines, picture, shown_apart
-from aftbed.cli.views import progress_bar, spaced
 from aftbed.core.errors import ConfigError
 from aftbed.functions.request_file import names_function
 from aftbed.functions.source import located
-from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach
+from aftbed.judge.verdict import EXIT_CODES, Breach
+from aftbed.report.progress import ProgressLine, spaced
 from aftbed.runtime.sim.world import Setup
 from aftbed.runtime.unix.worker_pool import once, own_seconds_max
 from aftbed.search.explore import (
@@ -140,7 +141,8 @@ def _explore(explorer: str, given: NumberedArguments) -> int:
         note_unusable()
     apart = bool(selection.application)
     # How many points a run has is found by simulating it.
-    setups = once(_setups, selection, own_seconds_max(REQUESTS_MAX), apart=apart)
+    with ProgressLine(f"explore {explorer}: finding what can be struck", plain=False):
+        setups = once(_setups, selection, own_seconds_max(REQUESTS_MAX), apart=apart)
     if given.only is not None:
         if not 0 <= given.only < len(setups):
             raise ConfigError(
@@ -150,30 +152,33 @@ def _explore(explorer: str, given: NumberedArguments) -> int:
         if not apart:
             return one(given.only)
         return shown_apart(one, given.only, REQUESTS_MAX, lambda number, _: _command(selection, number))
-    runs, unavailable, broken, interrupted = 0, 0, list[Broken](), False
+    runs, unavailable, broken, stopped = 0, 0, list[Broken](), False
     results = explore_all(setups, jobs, lambda number, _: _command(selection, number), apart=apart)
     try:
-        with progress_bar(f"explore {explorer}", len(setups), quiet=given.json) as show, closing(results):
+        with (
+            ProgressLine(f"explore {explorer}", len(setups), "runs", plain=not given.json) as progress,
+            closing(results),
+        ):
             for number, setup, lost, breaches in results:
                 runs += 1
                 unavailable += lost and not breaches
                 if breaches:
                     broken.append(broken_one(selection, number, setup, breaches))
                     if not given.json and len(broken) <= LISTED_MAX:
-                        print(_breach_text(broken[-1]), flush=True)
-                show(runs, runs, len(broken))
+                        progress.print(_breach_text(broken[-1]))
+                progress.show(runs, note=_broken(len(broken)))
     except KeyboardInterrupt:
-        interrupted = True
+        stopped = True
     result = Explored(runs, runs - len(broken), unavailable, _since(began_s), tuple(broken))
     if given.json:
         print_json(result)
     else:
         if len(broken) > LISTED_MAX:
             print(f"and {spaced(len(broken) - LISTED_MAX)} more; --json lists them all")
-        if runs < len(setups):
-            print(_interrupted(runs, len(setups)))
         print(_count(result))
-    return EXIT_INTERRUPTED if interrupted else EXIT_CODES["fail" if broken else "pass"]
+    if stopped:
+        return interrupted(_done(runs, len(setups)))
+    return EXIT_CODES["fail" if broken else "pass"]
 
 
 def _setups(selection: Selection) -> list[Setup]:
@@ -224,8 +229,12 @@ def _count(result: Explored) -> str:
     )
 
 
-def _interrupted(runs: int, of: int) -> str:
-    return f"interrupted: {spaced(runs)} of {spaced(of)} were run"
+def _broken(count: int) -> str:
+    return f"{spaced(count)} broken" if count else ""
+
+
+def _done(runs: int, of: int) -> str:
+    return f"{spaced(runs)} of {spaced(of)} were run; nothing is kept"
 
 
 def _since(began_s: float) -> float:
@@ -245,16 +254,16 @@ def order(given: ExploreOrderArguments) -> int:
     # The same mechanisms as those of `crash`.
     chosen = selected("crash", separated(given.ftm), separated(given.placement), given.requests)
     setups = list(experiments(chosen.ftms, chosen.placements, given.requests))
-    interrupted = False
+    stopped = False
     try:
-        with progress_bar("explore order", len(setups), quiet=given.json) as show:
+        with ProgressLine("explore order", len(setups), "experiments", plain=not given.json) as progress:
             for one in explore_orders(setups, given.bound, jobs):
                 found.append(one)
-                show(len(found), len(found), sum(bool(o.broken) for o in found))
                 if not given.json:
-                    print(_order_text(one), flush=True)
+                    progress.print(_order_text(one))
+                progress.show(len(found), note=_broken(sum(bool(o.broken) for o in found)))
     except KeyboardInterrupt:
-        interrupted = True
+        stopped = True
     orders, broken = sum(o.orders for o in found), sum(o.broken for o in found)
     complete, seconds = sum(o.complete for o in found), _since(began_s)
     if given.json:
@@ -273,13 +282,13 @@ def order(given: ExploreOrderArguments) -> int:
         }
         print_json(document)
     else:
-        if interrupted:
-            print(_interrupted(len(found), len(setups)))
         print(
             f"{spaced(orders - broken)} of {spaced(orders)} orders survived; all orders of {complete} of"
             f" {len(found)} experiments, the others up to {spaced(given.bound)} runs each; {seconds:.1f} s"
         )
-    return EXIT_INTERRUPTED if interrupted else EXIT_CODES["fail" if broken else "pass"]
+    if stopped:
+        return interrupted(_done(len(found), len(setups)))
+    return EXIT_CODES["fail" if broken else "pass"]
 
 
 def _order_text(one: OrderedRuns) -> str:

@@ -3,7 +3,6 @@
 The times of adaptations are measured here, on real processes, or read from files of `aftbed bench adapt`.
 """
 
-import sys
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Final
@@ -17,6 +16,7 @@ from aftbed.cli.ftm import TableOption, table_of
 from aftbed.cli.options import Json, check_range, print_json, takes
 from aftbed.core.errors import ConfigError
 from aftbed.ftm.registry import SHIPPED
+from aftbed.report.progress import ProgressLine
 
 ADAPTATIONS: Final = 3  # of each kind
 ADAPTATIONS_MAX: Final = 1000
@@ -73,7 +73,8 @@ def resilience_(given: ResilienceArguments) -> None:
         times |= {pair: (time, str(path)) for pair, time in _read(path, needed).items()}
     missing = [pair for pair in needed if pair not in times]
     if given.adaptations:
-        measured = bench_pairs(missing, given.adaptations, _show_progress)
+        with ProgressLine("ftm resilience", unit="adaptations", plain=not given.json) as progress:
+            measured = bench_pairs(missing, given.adaptations, progress.step, progress.show)
         times |= {pair: (time, "measured") for pair, time in measured.items()}
     timed = [_timed(one, times) for one in found.adaptations]
     mean = _mean(timed)
@@ -131,10 +132,6 @@ def _mean(timed: list[TimedAdaptation]) -> AdaptationMean | None:
     blackout_ms = sum(count * ms for count, ms, _ in known) / changes
     total_ms = sum(count * ms for count, _, ms in known) / changes
     return AdaptationMean(round(blackout_ms, 3), round(total_ms, 3), changes)
-
-
-def _show_progress(what: str) -> None:
-    print(f"  measuring: {what}", file=sys.stderr, flush=True)
 
 
 # -- as text --------------------------------------------------------------------------------------

@@ -20,7 +20,15 @@ from aftbed.ftm.compose import expressions
 from aftbed.functions.load import OWN_CODE
 from aftbed.functions.request_file import located_requests, requests_from
 from aftbed.functions.source import is_foreign, located, parse_source
-from aftbed.judge.measured import MeasuredFunction, StateChange, UnmeasuredError, measure
+from aftbed.judge.exercise import Answer, Surroundings, Task
+from aftbed.judge.measured import (
+    MeasuredFunction,
+    ProcessHost,
+    StateChange,
+    UnmeasuredError,
+    measure,
+)
+from aftbed.report.progress import ProgressLine
 from aftbed.vehicle.aeb.function import sample_requests
 
 function = typer.Typer(cls=PlainGroup)
@@ -28,6 +36,7 @@ function.command()(new)
 EXIT_OVERSTATED: Final = 1
 COUNT: Final = 200
 COUNT_MAX: Final = 100_000
+TASKS: Final = 4  # of a function with a state; each has a process of its own
 HEADER: Final = Path(functions.__file__).with_name("aft.h")
 OF_THE_BRAKE: Final = "the requests are those of the brake function; --requests gives others"
 
@@ -51,7 +60,8 @@ def check(
     place = located(source)
     payloads = _requests(place, requests, count, seed)
     try:
-        found = measure(place, payloads, seed)
+        with ProgressLine("app check", TASKS, "processes", plain=not json) as progress:
+            found = measure(place, payloads, seed, _Counted(ProcessHost(place), progress))
     except UnmeasuredError as error:
         raise UnmeasuredError(f"{error} ({OF_THE_BRAKE})" if requests is None else str(error)) from None
     note_unusable()
@@ -67,9 +77,25 @@ def check(
 
 
 @function.command()
-def header() -> None:
+def header(json: Json = False) -> None:
     """Print the path of aft.h, which a C library includes."""
-    print(HEADER)
+    if json:
+        print_json({"header": str(HEADER)})
+    else:
+        print(HEADER)
+
+
+class _Counted:
+    """A host of tasks that counts them."""
+
+    def __init__(self, host: ProcessHost, progress: ProgressLine) -> None:
+        self._host, self._progress, self._done = host, progress, 0
+
+    def __call__(self, task: Task, surroundings: Surroundings, seconds: float) -> Answer:
+        found = self._host(task, surroundings, seconds)
+        self._done += 1
+        self._progress.show(self._done)
+        return found
 
 
 def _requests(app: str, source: str | None, count: int | None, seed: int) -> list[bytes]:

@@ -10,7 +10,7 @@ import msgspec
 import typer
 from msgspec.structs import asdict, replace
 
-from aftbed.cli.options import Run, takes
+from aftbed.cli.options import Json, Run, print_json, takes
 from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.inject.bus import read_bus_fault
@@ -79,6 +79,7 @@ class CrashArguments(msgspec.Struct, frozen=True, kw_only=True):
     after: After = None
     when: When = None
     run: Run = None
+    json: Json = False
 
 
 class HangArguments(CrashArguments, frozen=True, kw_only=True):
@@ -111,6 +112,7 @@ class ChannelArguments(msgspec.Struct, frozen=True, kw_only=True):
     every: Every = None
     chance: Chance = None
     run: Run = None
+    json: Json = False
 
 
 class DelayArguments(ChannelArguments, frozen=True, kw_only=True):
@@ -156,6 +158,7 @@ class BitflipArguments(msgspec.Struct, frozen=True, kw_only=True):
     every: Every = None
     chance: Chance = None
     run: Run = None
+    json: Json = False
 
 
 def _command(kind: str, arguments: type[CrashArguments] | type[ChannelArguments], about: str) -> None:
@@ -165,7 +168,7 @@ def _command(kind: str, arguments: type[CrashArguments] | type[ChannelArguments]
     @takes(arguments)
     def strike(given: CrashArguments | ChannelArguments) -> None:
         subject = given.target if isinstance(given, CrashArguments) else given.channel
-        _arm(given.run, read([kind, subject, *_words(given)]))
+        _arm(given.run, read([kind, subject, *_words(given)]), as_json=given.json)
 
 
 _command("crash", CrashArguments, "SIGKILL the target's processes.")
@@ -192,7 +195,7 @@ def bitflip(given: BitflipArguments) -> None:
         refuse_unsafe(f"--level {MEMORY}", agreed=given.unsafe_memory)
         what, given = MEMORY, replace(given, replica=given.place)
     byte = [] if given.byte is None else ["byte"] if given.byte == DRAWN else ["byte", given.byte]
-    _arm(given.run, read(["bitflip", what, *_words(given, byte)]))
+    _arm(given.run, read(["bitflip", what, *_words(given, byte)]), as_json=given.json)
 
 
 @inject.command()
@@ -202,21 +205,23 @@ def fault(
         bool, typer.Option("--unsafe-memory", help='Allow "bitflip memory ...".')
     ] = False,
     run: Run = None,
+    json: Json = False,
 ) -> None:
     """Any fault in the words of `run --inject`; the word `fault` itself may be left out."""
     found = parse(words)
     if found.action.unsafe:
         refuse_unsafe(str(found), agreed=unsafe_memory)
-    _arm(run, found)
+    _arm(run, found, as_json=json)
 
 
 @inject.command()
 def bus(
     words: Annotated[str, typer.Argument(help='E.g. "omission bus RADAR_TRACK for 200ms": docs/faults.md.')],
     run: Run = None,
+    json: Json = False,
 ) -> None:
     """Disturb frames on the CAN bus, or disconnect nodes from it."""
-    _arm(run, on_bus(read_bus_fault(words)))
+    _arm(run, on_bus(read_bus_fault(words)), as_json=json)
 
 
 class RadarArguments(msgspec.Struct, frozen=True, kw_only=True):
@@ -239,13 +244,14 @@ class RadarArguments(msgspec.Struct, frozen=True, kw_only=True):
     every: Every = None
     chance: Chance = None
     run: Run = None
+    json: Json = False
 
 
 @inject.command()
 @takes(RadarArguments)
 def radar(given: RadarArguments) -> None:
     """Make the car's radar report what is not so: docs/faults.md."""
-    _arm(given.run, read([RADAR, *given.words, *_words(given)]))
+    _arm(given.run, read([RADAR, *given.words, *_words(given)]), as_json=given.json)
 
 
 # -- options to words, words to the run -----------------------------------------------------------
@@ -271,10 +277,13 @@ class _RecordHead(msgspec.Struct, frozen=True):
     work: Work
 
 
-def _arm(run: str | None, fault: Fault) -> None:
+def _arm(run: str | None, fault: Fault, *, as_json: bool) -> None:
     """Have the run arm the fault. The messages and signals it may name are those of the run's work."""
     private = run_directory.find(run)
     record = Path(str(control_client.ask(private, control_client.StatusQuery())["record"]))
     head = msgspec.json.decode((record / "run.json").read_bytes(), type=_RecordHead)
     control_client.ask(private, control_client.InjectCommand(with_names_resolved(fault, head.work)))
-    print(f"run {private.name}: {fault}", file=sys.stderr)
+    if as_json:
+        print_json({"run": private.name, "fault": str(fault)})
+    else:
+        print(f"run {private.name}: {fault}", file=sys.stderr)

@@ -9,7 +9,7 @@ import typer
 
 from aftbed.cli.options import Json, Run, print_blocks, print_json
 from aftbed.cli.views import car_line, event_line, requests_line, sight_line
-from aftbed.core.errors import shown, unknown
+from aftbed.core.errors import ConfigError, shown, unknown
 from aftbed.core.graph import Graph
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix import control_client, run_directory
@@ -78,11 +78,14 @@ def ps(run: Run = None, json: Json = False) -> None:
     print(f"{len(nodes_mb)} processes, {sum(nodes_mb):.1f} MB; {len(rows) - len(nodes_mb)} beside")
 
 
-def stop(run: Run = None) -> None:
+def stop(run: Run = None, json: Json = False) -> None:
     """End a live run; its command prints the verdict so far."""
     private = run_directory.find(run)
     control_client.ask(private, control_client.StopCommand())
-    print(f"run {private.name}: stopping")
+    if json:
+        print_json({"run": private.name, "stopping": True})
+    else:
+        print(f"run {private.name}: stopping")
 
 
 # -- graph ----------------------------------------------------------------------------------------
@@ -93,8 +96,11 @@ def graph(
     placement: Annotated[str, typer.Option(help="With --ftm: process or replica.")] = "process",
     style: Annotated[str, typer.Option("--format", help="text, dot or mermaid.")] = "text",
     run: Run = None,
+    json: Json = False,
 ) -> None:
     """The bricks, their channels and their nodes."""
+    if json and style != "text":
+        raise ConfigError(f"--json and --format {style}: one of them is allowed")
     if style not in FORMATS:
         raise unknown("format", style, FORMATS)
     if ftm is not None:
@@ -103,7 +109,10 @@ def graph(
         shown = msgspec.convert(
             control_client.ask(run_directory.find(run), control_client.GraphQuery()), Graph
         )
-    print(FORMATS[style](shown))
+    if json:
+        print_json(shown)
+    else:
+        print(FORMATS[style](shown))
 
 
 def _text(graph: Graph) -> str:

@@ -4,7 +4,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from msgspec.structs import asdict
 
+from aftbed.cli.options import Json, print_json
 from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError, shown
 
@@ -31,11 +33,15 @@ def convert(
     skip_bad: Annotated[
         bool, typer.Option("--skip-bad", help="Leave out what cannot be read of SOURCE, and count it.")
     ] = False,
+    json: Json = False,
 ) -> None:
     """Write a log of a CAN bus in another format."""
     from aftbed.interop.logs import convert as convert_log  # noqa: PLC0415 - imports python-can
 
     done = convert_log(source, sink, from_format, to_format, dbc, skip_bad=skip_bad)
+    if json:
+        print_json({"file": str(sink)} | asdict(done))
+        return
     print(f"{sink}: {done.frames} frames, {done.source} to {done.sink}")
     for reason, count in done.left_out.items():
         print(f"  left out: {count} times {reason}")
@@ -48,6 +54,7 @@ def export(
     record: Annotated[Path, typer.Argument(help="The directory of --record.")],
     mcap: Annotated[Path | None, typer.Option(help="Write the run to this file, for Foxglove.")] = None,
     trace: Annotated[Path | None, typer.Option(help="Write its nodes to this file, for Perfetto.")] = None,
+    json: Json = False,
 ) -> None:
     """Write the record of a run as files that other tools open."""
     from aftbed.interop.export import ExportFiles, check  # noqa: PLC0415 - imports the simulator, 200 ms
@@ -58,5 +65,8 @@ def export(
     if files == ExportFiles():
         raise ConfigError("nothing to write: give --mcap FILE, --trace FILE, or both")
     check(files)
-    for line in write_files(read_record(record), files):
-        print(line)
+    written = write_files(read_record(record), files)
+    if json:
+        print_json({"files": written})
+    else:
+        print("\n".join(map(str, written)))

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import msgspec
 import typer
 
+from aftbed.cli.interrupted import EXIT_INTERRUPTED
 from aftbed.cli.options import (
     RATE_HZ_MAX,
     VERIFIES,
@@ -171,6 +172,11 @@ class RunArguments(msgspec.Struct, frozen=True):
     quiet: Quiet = False
     json: Json = False
 
+    @property
+    def silent(self) -> bool:
+        """Standard output is for the verdict alone."""
+        return self.json or self.quiet
+
 
 DEFAULTS: Final = RunArguments()
 OF_A_REPLAY: Final = ("dbc", "map_file", "skip_bad", "loop")
@@ -230,7 +236,6 @@ def execute(given: RunArguments) -> int:
         command=shlex.join(("aftbed", *sys.argv[1:])),
         evidence=given.junit is not None,
     )
-    silent = given.json or given.quiet
     with contextlib.ExitStack() as page:
         if given.web:  # before the launch, whose processes would inherit its socket
             page.enter_context(_page(given, Path(options.private)))
@@ -238,20 +243,27 @@ def execute(given: RunArguments) -> int:
         del log  # it may be large, and the run has it
         try:
             closed = make_loop(launched) if make_loop is not None else None
-            interrupted = _follow(launched, _open_view(options, quiet=silent), closed)
+            interrupted = _follow(launched, _open_view(options, quiet=given.silent), closed)
             page.close()
             launched.wait()
-            from aftbed.cli.check import judge_and_show, write_html, write_junit  # noqa: PLC0415 - after the launch
-            from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED  # noqa: PLC0415 - after the launch
+            from aftbed.cli.check import (  # noqa: PLC0415 - after the launch
+                judge_and_show,
+                keep_verdict,
+                write_html,
+                write_junit,
+            )
+            from aftbed.judge.verdict import EXIT_CODES  # noqa: PLC0415 - after the launch
             from aftbed.runtime.unix.trust import OWN_RUN, remember  # noqa: PLC0415 - after the launch
 
             if why_not := remember(launched.record):
                 text = f"aftbed check will ask for --trust: what was run cannot be remembered: {why_not}"
                 print(f"aftbed: note: {text}", file=sys.stderr)
             verdict = judge_and_show(launched.record, OWN_RUN, as_json=given.json, quiet=given.quiet)
+            if given.record is not None:
+                keep_verdict(launched.record, verdict)
             if launched.trouble:
                 print(f"aftbed: trouble: {launched.trouble}", file=sys.stderr)
-            elif verdict.verdict == "inconclusive" and not silent:
+            elif verdict.verdict == "inconclusive" and not given.silent:
                 _show_log(launched.record / "processes.log")
             writers = list[Callable[[], list[str]]]()
             if write_files is not None:
@@ -260,7 +272,7 @@ def execute(given: RunArguments) -> int:
                 writers.append(partial(write_junit, given.junit, verdict))
             if given.html is not None:
                 writers.append(partial(write_html, given.html, launched.record, verdict))
-            unwritten = [write for write in writers if not _written(write, silent=silent)]
+            unwritten = [write for write in writers if not _written(write, silent=given.silent)]
         finally:
             launched.remove()
     code = EXIT_CODES[verdict.verdict]
@@ -534,7 +546,7 @@ def _files(given: RunArguments) -> Callable[[Path], list[str]] | None:
 
     files = ExportFiles(given.mcap, given.trace)
     check(files)
-    return lambda record: export(read_record(record), files)
+    return lambda record: list(map(str, export(read_record(record), files)))
 
 
 def _written(write: Callable[[], list[str]], *, silent: bool) -> bool:

@@ -11,11 +11,12 @@ import rich.table
 import typer
 from rich.console import Console
 
+from aftbed.cli.interrupted import interrupted
 from aftbed.cli.options import Json, Seed, check_file, check_seed, jobs_of, print_json, separated, takes
-from aftbed.cli.views import progress_bar
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED
+from aftbed.judge.verdict import EXIT_CODES
 from aftbed.report.plots import FttiCurve, TimeBand, ftti_plot
+from aftbed.report.progress import ProgressLine
 from aftbed.search.ftti import (
     FTTI_MAX_MS,
     Fhti,
@@ -72,14 +73,13 @@ def ftti(given: FttiArguments) -> int:
     try:
         with (
             closing(searched(todo, jobs_of(given.jobs))) as coming,
-            progress_bar("searching", len(todo), quiet=given.json) as show,
+            ProgressLine("scenario ftti", len(todo), "searches", plain=not given.json) as progress,
         ):
             for row in coming:
                 rows.append(margins(row, figures))
-                show(len(rows), len(rows), 0)
+                progress.show(len(rows))
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
+        return interrupted(f"{len(rows)} of {len(todo)} searches were done; nothing is kept")
     if given.plot is not None:
         _plot(given.plot, given.brake_policy, rows, figures)
     if given.json:

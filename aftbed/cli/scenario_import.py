@@ -6,11 +6,13 @@ from typing import Annotated
 
 import typer
 
+from aftbed.cli.interrupted import told_if_interrupted
 from aftbed.cli.options import Json, print_json
 from aftbed.core.errors import ConfigError, shown
 from aftbed.interop.openscenario.document import CAUSES, Cause
 from aftbed.interop.openscenario.folder import FileReport, import_folder
 from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, import_scenario, write
+from aftbed.report.progress import ProgressLine
 
 NOTHING_IMPORTED = 2
 
@@ -126,11 +128,16 @@ def _row(imported: ImportedFile, path: str, line: int, element: str, words: str)
 def _import_folder(
     folder: Path, options: ImportOptions, out: Path | None, *, force: bool, json: bool
 ) -> None:
-    reports = []
-    for report in import_folder(folder, options, out, force=force):
-        reports.append(report)
-        if not json:
-            print(shown(_line(report)), flush=True)
+    reports: list[FileReport] = []
+    kept = "nothing is kept" if out is None else f"their scenarios are in {out}"
+    with (
+        told_if_interrupted(lambda: f"{len(reports)} files were done; {kept}"),
+        ProgressLine("scenario import", unit="files", plain=not json) as progress,
+    ):
+        for report in import_folder(folder, options, out, force=force, show=progress.show):
+            reports.append(report)
+            if not json:
+                progress.print(shown(_line(report)))
     accepted = sum(report.accepted for report in reports)
     causes = Counter(report.cause for report in reports if report.cause is not None)
     if json:

@@ -13,6 +13,7 @@ import rich.table
 import typer
 from rich.console import Console
 
+from aftbed.cli.interrupted import interrupted
 from aftbed.cli.options import (
     Json,
     Seed,
@@ -24,15 +25,15 @@ from aftbed.cli.options import (
     takes,
 )
 from aftbed.cli.sim import read_fault
-from aftbed.cli.views import progress_bar
 from aftbed.core.errors import ConfigError
 from aftbed.core.units import milliseconds, whole_milliseconds
 from aftbed.ftm.compose import build
 from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault, parse
-from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED
+from aftbed.judge.verdict import EXIT_CODES
 from aftbed.report.plots import RoadCurve, RoadPoint, road_plot
+from aftbed.report.progress import ProgressLine
 from aftbed.search.road_table import NONE, PRIMARY, DrivenRow, RoadLine, driven, drives, outage
 from aftbed.search.worst_instant import STEP_CYCLES
 from aftbed.vehicle.scenarios import tables
@@ -144,11 +145,13 @@ def table(given: TableArguments) -> int:
     """
     found = table_drive(given)
     began_s = time.monotonic()
+    done: dict[tuple[str, str], DrivenRow] = {}
     try:
-        rows = _drive(found, quiet=given.json)
+        _drive(found, done, plain=not given.json)
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
+        of = len(found.lines) * len(found.cases)
+        return interrupted(f"{len(done)} of {of} rows were driven; nothing is kept")
+    rows = [done[line.name, case.name] for line in found.lines for case in found.cases]
     seconds = round(time.monotonic() - began_s, 2)
     if given.plot is not None:
         _plot(given.plot, given.name, found, rows)
@@ -167,15 +170,17 @@ def table(given: TableArguments) -> int:
     return EXIT_CODES["pass" if struck == len(rows) else "inconclusive"]
 
 
-def _drive(found: TableDrive, *, quiet: bool) -> list[DrivenRow]:
-    """All rows, in the order of the lines and of the table."""
+def _drive(found: TableDrive, rows: dict[tuple[str, str], DrivenRow], *, plain: bool) -> None:
+    """Fill in `rows`, by line and case."""
     todo = drives(found.cases, found.lines, found.seed)
-    rows: dict[tuple[str, str], DrivenRow] = {}
-    with closing(driven(todo, found.jobs)) as coming, progress_bar("driving", len(todo), quiet=quiet) as show:
+    with (
+        closing(driven(todo, found.jobs)) as coming,
+        ProgressLine("scenario table", len(todo), "drives", plain=plain) as progress,
+    ):
         for done, these in enumerate(coming, 1):
-            rows |= {(row.line, row.case): row for row in these}
-            show(done, len(rows), sum(not row.passed for row in rows.values()))
-    return [rows[line.name, case.name] for line in found.lines for case in found.cases]
+            rows.update({(row.line, row.case): row for row in these})
+            failed = sum(not row.passed for row in rows.values())
+            progress.show(done, note=f"{failed} rows fail" if failed else "")
 
 
 def _plot(path: Path, table: str, found: TableDrive, rows: Sequence[DrivenRow]) -> None:

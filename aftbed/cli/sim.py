@@ -21,6 +21,7 @@ from msgspec.structs import asdict, replace
 
 from aftbed.adapt import commands
 from aftbed.cli.adapt import refuse_unsuitable, scheduled
+from aftbed.cli.interrupted import interrupted
 from aftbed.cli.options import (
     RATE_HZ_MAX,
     SEED_MAX,
@@ -37,7 +38,7 @@ from aftbed.cli.options import (
     takes,
 )
 from aftbed.cli.request_options import RequestSource, first_requests
-from aftbed.cli.views import progress_bar, show_verdict, spaced
+from aftbed.cli.views import show_verdict
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Goal, Scheduled
@@ -51,8 +52,9 @@ from aftbed.inject.targets import OTHERS
 from aftbed.judge.asked import not_happened
 from aftbed.judge.outcome import outcome_of
 from aftbed.judge.simulated import evidence_of_run, verdict_of
-from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach, Verdict, Word
+from aftbed.judge.verdict import EXIT_CODES, Breach, Verdict, Word
 from aftbed.report import sequence
+from aftbed.report.progress import ProgressLine, spaced
 from aftbed.runtime.sim.clock import START_NS
 from aftbed.runtime.sim.trace import traced
 from aftbed.runtime.sim.world import Run, Setup
@@ -619,6 +621,7 @@ class _ManyRuns:
         self._broken: list[tuple[Setup, tuple[Breach, ...]]] = []
         self._missed: list[str] = []
         self._tally = Tally()
+        self._progress = ProgressLine("sim")
 
     def simulate(self, make: MakeSetup, first: int, last: int, jobs: int) -> int:
         """Simulate the seeds from `first` to `last` in `jobs` processes, show the result; the exit code."""
@@ -626,6 +629,8 @@ class _ManyRuns:
         seconds = (given.minutes or 0.0) * 60
         if not given.json:
             print(f"seeds {first}..{'' if seconds else last}", flush=True)
+        total, unit = (seconds, "s") if seconds else (last - first + 1, "runs")
+        self._progress = ProgressLine("sim", total, unit, plain=not given.json)
         setups = map(make, range(first, last + 1))
         try_ = partial(tried, attempt=_attempt(swarm=given.swarm))
         count = make(first).count if self._apart else 0
@@ -638,29 +643,22 @@ class _ManyRuns:
             seconds_max=seconds_max,
             apart=self._apart,
         )
-        interrupted = False
+        stopped = False
         try:
-            with progress_bar("sim", seconds or last - first + 1, quiet=given.json) as show, closing(results):
+            with self._progress, closing(results):
                 for number, setup, found in results:
                     self._count(setup, found)
                     took_s = time.monotonic() - began_s
-                    show(took_s if seconds else number + 1, self._runs, len(self._broken))
+                    counts = [f"{spaced(self._runs)} runs"] if seconds else []
+                    counts += [f"{spaced(len(self._broken))} broken"] if self._broken else []
+                    self._progress.show(
+                        min(took_s, seconds) if seconds else number + 1, note=", ".join(counts)
+                    )
                     if seconds and took_s >= seconds:
                         break
         except KeyboardInterrupt:
-            interrupted = True
-        broken = [
-            self._simulated_again(
-                partial(
-                    broken_run,
-                    broken=found,
-                    swarm=given.swarm,
-                    shrinks=number < SHRUNK_MAX and not interrupted,
-                ),
-                setup,
-            )
-            for number, (setup, found) in enumerate(self._broken)
-        ]
+            stopped = True
+        broken = self._looked_at(shrunk_max=0 if stopped else SHRUNK_MAX)
         if given.diagram is not None and self._broken:
             broken_setup, breaches = self._broken[0]
             draw = partial(picture, broken=breaches, path=given.diagram)
@@ -670,7 +668,24 @@ class _ManyRuns:
         self._show(broken, (first, first + self._runs - 1), max(took_s, 1e-9))
         proves_little = bool(self._inconclusive or self._vacuous())
         word: Word = "fail" if self._broken else "inconclusive" if proves_little else "pass"
-        return EXIT_INTERRUPTED if interrupted else EXIT_CODES[word]
+        if stopped:
+            rest = f"--seed {first + self._runs}" if seconds else f"--seeds {first + self._runs}..{last}"
+            return interrupted(f"{spaced(self._runs)} runs were done; {rest} goes on")
+        return EXIT_CODES[word]
+
+    def _looked_at(self, shrunk_max: int) -> list[BrokenRun]:
+        """The broken runs, the first few of them shrunk."""
+        if not self._broken:
+            return []
+        found = list[BrokenRun]()
+        total = len(self._broken)
+        with ProgressLine("sim: shrinking", total, "runs", plain=not self._given.json) as progress:
+            for number, (setup, broken) in enumerate(self._broken):
+                shrinks = number < shrunk_max
+                again = partial(broken_run, broken=broken, swarm=self._given.swarm, shrinks=shrinks)
+                found.append(self._simulated_again(again, setup))
+                progress.show(number + 1)
+        return found
 
     def _simulated_again(self, look: Callable[[Setup], T], setup: Setup) -> T:
         return once(look, setup, SECONDS_MAX, apart=self._apart)
@@ -687,7 +702,7 @@ class _ManyRuns:
         if found.breaches:
             self._broken.append((setup, found.breaches))
             if not self._given.json and len(self._broken) <= LISTED_MAX:
-                print(f"seed {setup.seed}: {found.breaches[0]}", flush=True)
+                self._progress.print(f"seed {setup.seed}: {found.breaches[0]}")
 
     def _vacuous(self) -> list[str]:
         """Why a swarm proves too little; other runs were asked for one by one, see `missed`."""
@@ -741,7 +756,8 @@ def _compare(given: SimArguments) -> int:
             "--against: the experiments are the records'; only --seeds, --trust and --json go with it"
         )
     first, last = _seeds(given) if given.seeds is not None else (0, SEEDS - 1)
-    found = against(given.against, last - first + 1, trusting(given.trust))
+    with ProgressLine("sim --against", unit="runs", plain=not given.json) as progress:
+        found = against(given.against, last - first + 1, trusting(given.trust), progress.show)
     disagreeing = sum(bool(one.why_not) for one in found)
     if given.json:
         print_json({"agree": not disagreeing, "experiments": found})

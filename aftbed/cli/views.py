@@ -1,13 +1,10 @@
-"""What several commands print: a run while it lives, a verdict, adaptations that ended, a progress bar.
+"""What several commands print: a run while it lives, a verdict, adaptations that ended.
 
 rich is imported only where the output is a terminal. `aftbed run` imports this module before it forks the
 supervisor, so nothing else that is large is imported here.
 """
 
-import sys
-import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
 import msgspec
@@ -28,7 +25,6 @@ if TYPE_CHECKING:
 STAGES: Final = ("-", "WARN", "PARTIAL", "FULL")
 PLAIN_PERIOD_MS: Final = 500
 KMH_PER_MS: Final = 3.6
-BAR_PERIOD_S: Final = 0.1
 STYLES_OF_VERDICTS: Final = {"pass": Style.GOOD, "fail": Style.SERIOUS, "inconclusive": Style.WARN}
 STYLES_OF_CHECKS: Final = {"pass": Style.PLAIN, "fail": Style.SERIOUS, "unknown": Style.WARN}
 
@@ -267,59 +263,3 @@ def history_lines(ended: list[EndedAdaptation]) -> Iterator[str]:
         bricks = f"{one.bricks_changed}/{one.bricks_total}"
         yield f"{one.number:>3} {one.asked_ms / 1e3:>7.2f} s {took} {bricks:>7} {one.recipe:7} {one}"
     yield f"{len(ended)} adaptation{'s' if len(ended) != 1 else ''}"
-
-
-# -- progress -------------------------------------------------------------------------------------
-
-
-def spaced(number: float) -> str:
-    """A whole number in groups of three digits, as `8 867`."""
-    return f"{number:,.0f}".replace(",", " ")
-
-
-@contextmanager
-def progress_bar(what: str, total: float, *, quiet: bool) -> Iterator[Callable[[float, int, int], None]]:
-    """A progress bar with the rate and the failures, on standard error if that is a terminal.
-
-    What it yields shows how much of `total` is done, the runs and those that broke a promise. It redraws at
-    most every BAR_PERIOD_S, and without a thread: a thread would be forked with the processes that simulate.
-    """
-    if quiet or not sys.stderr.isatty():
-        yield lambda done, runs, broken: None
-        return
-    from rich.console import Console  # noqa: PLC0415 - only on a terminal
-    from rich.progress import (  # noqa: PLC0415 - only on a terminal
-        BarColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.fields[count]}"),
-        TimeRemainingColumn(),
-    )
-    bar = Progress(
-        *columns,
-        console=Console(stderr=True),
-        auto_refresh=False,
-        transient=True,
-        redirect_stdout=sys.stdout.isatty(),
-    )
-    task = bar.add_task(what, total=total, count="")
-    began_s = shown_s = time.monotonic()
-
-    def show(done: float, runs: int, broken: int) -> None:
-        nonlocal shown_s
-        now_s = time.monotonic()
-        if now_s < shown_s + BAR_PERIOD_S:
-            return
-        shown_s = now_s
-        rate = runs / max(now_s - began_s, 1e-9)
-        count = f"{spaced(runs)} runs, {spaced(rate)}/s, {broken} broken"
-        bar.update(task, completed=done, count=count, refresh=True)
-
-    with bar:
-        yield show

@@ -34,13 +34,24 @@ def check(files: ExportFiles) -> None:
         raise ConfigError(f"--mcap and --trace: {files.mcap} is asked for as both")
 
 
-def export(run: RunRecord, files: ExportFiles) -> list[str]:
-    """Write the files; a line about each. Raises ConfigError if one cannot be written."""
+class WrittenFile(msgspec.Struct, frozen=True):
+    """`count` of `what` are in it: messages, or trace events."""
+
+    file: str
+    count: int
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.file}: {self.count} {self.what}"
+
+
+def export(run: RunRecord, files: ExportFiles) -> list[WrittenFile]:
+    """Write the files. Raises ConfigError if one cannot be written."""
     found = []
     if files.mcap is not None:
         messages = write_whole(files.mcap, partial(mcap_file.write, run))
-        found.append(f"{files.mcap}: {messages} messages")
+        found.append(WrittenFile(str(files.mcap), messages, "messages"))
     if files.trace is not None:
         events = write_whole(files.trace, partial(perfetto.write, run))
-        found.append(f"{files.trace}: {events} trace events")
+        found.append(WrittenFile(str(files.trace), events, "trace events"))
     return found

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Final, TypeVar
 
 from aftbed.core.errors import ConfigError
+from aftbed.runtime.unix.interrupts import scratch_directory
 
 NAME_SHOWN_MAX: Final = 60  # characters, in the name of the directory
 
@@ -19,8 +19,8 @@ def write_whole(sink: Path, write: Callable[[Path], Answer]) -> Answer:
     was. An OSError is raised as ConfigError.
     """
     try:
-        with TemporaryDirectory(prefix=f".{sink.name[:NAME_SHOWN_MAX]}.", dir=sink.parent) as folder:
-            beside = Path(folder) / sink.name  # a directory of this user alone: no one has put a link there
+        with scratch_directory(f".{sink.name[:NAME_SHOWN_MAX]}.", sink.parent) as folder:
+            beside = folder / sink.name  # a directory of this user alone: no one has put a link there
             found = write(beside)
             beside.replace(sink)
     except OSError as error:

@@ -50,7 +50,6 @@ from datetime import UTC, datetime
 from enum import Enum
 from importlib.util import find_spec
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Final, Protocol, cast
 
 import msgspec
@@ -58,6 +57,7 @@ import msgspec
 from aftbed.core.errors import ConfigError, PeerError, spreadsheet_text, unknown
 from aftbed.interop.files import write_whole
 from aftbed.runtime.unix.confined import JobFailedError, ProcessLimits, ask, serve
+from aftbed.runtime.unix.interrupts import scratch_directory
 from aftbed.vehicle.can.candump import Refusal
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.frame import CAN_ID_MAX, DATA_LENGTH_MAX, Frame
@@ -656,9 +656,9 @@ def read_mf4(path: Path, *, skip_bad: bool = False) -> CanLog:
         raise ConfigError(f"{path}: not an MF4: it does not begin with MDF")
     _require_asammdf()
     try:
-        with TemporaryDirectory(prefix="aftbed-mf4-") as folder:  # asammdf leaves a file there
+        with scratch_directory("aftbed-mf4-") as folder:  # asammdf leaves a file there
             job = msgspec.msgpack.encode((str(path.absolute()), skip_bad))
-            answer = ask(__name__, job, MF4_LIMITS, {"TMPDIR": folder})
+            answer = ask(__name__, job, MF4_LIMITS, {"TMPDIR": str(folder)})
         found = msgspec.msgpack.decode(answer, type=CanLog | str)
     except JobFailedError as error:
         raise ConfigError(MF4_UNREADABLE.format(path=path, why=f"its reader {error}")) from None

@@ -27,7 +27,6 @@ from aftbed.vehicle.plant import VehicleResult
 
 Word = Literal["pass", "fail", "inconclusive"]
 EXIT_CODES: Final[dict[Word, int]] = {"pass": 0, "fail": 1, "inconclusive": 3}
-EXIT_INTERRUPTED: Final = 130
 
 
 CHECKERS: Final = (  # a new check is one line here; its name is its key in every verdict

@@ -1,6 +1,6 @@
 """The reports of a campaign, and the drawings of a run, for people and for other programs.
 
-- `terminal`: progress while a campaign runs, and its summary;
+- `progress`: how far any long command is; `terminal`: that of a campaign, and its summary;
 - `junit`: for a CI, a test case per stratum and per gate, with the command that repeats the worst
   experiment;
 - `html`: one file for a person, which needs neither network nor script; `worst` chooses the runs that it

@@ -43,6 +43,7 @@ from aftbed.core.application import Characteristics
 from aftbed.core.archive import ArchiveLimits, opened_archive
 from aftbed.core.errors import ConfigError
 from aftbed.core.input_file import read_input
+from aftbed.core.progress import Show, unshown
 from aftbed.core.yaml_file import yaml_text
 from aftbed.functions.request_file import names_function
 from aftbed.functions.source import FunctionKind, parse_source
@@ -96,8 +97,10 @@ class CampaignEnvironment(msgspec.Struct, frozen=True):
 # -- what is put into it --------------------------------------------------------------------------
 
 
-def entries(found: Sequence[Ledger], trust: Trust) -> dict[str, BundledFile]:
-    """The files of a bundle of these campaigns, by name. Nothing is executed but what `trust` allows.
+def entries(found: Sequence[Ledger], trust: Trust, show: Show = unshown) -> dict[str, BundledFile]:
+    """The files of a bundle of these campaigns, by name; `show` gets how many of the worst runs are done.
+
+    Nothing is executed but what `trust` allows.
 
     Raises ConfigError: a shard alone, records that are not of their own plan, functions or requests that are
     not there any more, are others by now, or were never run by this user.
@@ -118,7 +121,8 @@ def entries(found: Sequence[Ledger], trust: Trust) -> dict[str, BundledFile]:
         made |= {f"{name}/{file}": _text(text) for file, text in documents(summary, portable).items()}
         made[f"{name}/{ENVIRONMENT}"] = BundledFile(_json(_environment(one, portable.head, files, trust)))
         kept = _kept(one, portable, files)
-        made |= {f"{name}/worst/{file}": entry for file, entry in _worst(portable.results, kept)}
+        worst = _worst(portable.results, kept, show)
+        made |= {f"{name}/worst/{file}": entry for file, entry in worst}
     runtimes = {name: one.head.spec.system.runtime for name, one in zip(campaigns, found, strict=True)}
     made["rerun.sh"] = BundledFile(_script(campaigns, runtimes).encode(), executable=True)
     made["README.md"] = _text(_readme(runtimes, carried=bool(files.places)))
@@ -187,7 +191,7 @@ def _functions(found: Ledger) -> list[str]:
 
 
 def _worst(
-    results: Sequence[Result], kept: Mapping[str, dict[str, bytes]]
+    results: Sequence[Result], kept: Mapping[str, dict[str, bytes]], show: Show
 ) -> Iterator[tuple[str, BundledFile]]:
     """A ledger keeps no messages, so what happened in a run is that of its simulation with the same seed.
 
@@ -195,7 +199,8 @@ def _worst(
     """
     worst = by_badness(results)[:WORST_MAX]
     worst += [result for result in results if result.experiment.id in kept and result not in worst]
-    for result in worst:
+    for number, result in enumerate(worst):
+        show(number, len(worst))
         name = result.experiment.id
         yield f"{name}/result.json", BundledFile(_json(result))
         again, command = rerun(result.experiment), result.experiment.command()
@@ -462,11 +467,16 @@ class Bundle(msgspec.Struct, frozen=True):
     misfits: tuple[Misfit, ...]
 
 
-def verified(path: Path) -> Bundle:
-    """Hash all of a bundle; nothing is unpacked. Raises ConfigError if it is none."""
+def verified(path: Path, show: Show = unshown) -> Bundle:
+    """Hash all of a bundle; nothing is unpacked. `show` gets how many files are done.
+
+    Raises ConfigError if it is none.
+    """
     with opened_archive(path, "a bundle", LIMITS) as (file, archive):
         files: dict[str, str] = {}
-        for one in archive.infolist():
+        members = archive.infolist()
+        for number, one in enumerate(members):
+            show(number, len(members))
             if one.is_dir():
                 continue
             digest = hashlib.sha256()

@@ -37,7 +37,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
 import msgspec
@@ -46,6 +46,7 @@ from aftbed.core.errors import AftbedError, ConfigError
 from aftbed.core.graph import Graph
 from aftbed.ftm.compose import expressions
 from aftbed.report.steering import ANSWER_CHARACTERS_MAX, COMMAND_S_MAX, child_command
+from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.unix import control_client, linux, run_directory
 from aftbed.runtime.unix.control_client import ProcessRow
 from aftbed.runtime.unix.run_directory import BUS_NAME, EVENT_LOG_NAME
@@ -81,7 +82,8 @@ class Snapshot(msgspec.Struct, frozen=True):
     `status` is that of `aftbed status --json`; `nodes` has the nodes of the graph with their bricks, dead
     ones too, `processes` those that live. `events` are those since the last snapshot. `frames_s` and
     `load_percent` (with stuffing at its worst, see `bus_load`) are of the bus, by its time; None without one.
-    `silent_s`: for how long the run has not answered; all else is then as before.
+    `blackout_ms`: of the last adaptation. `silent_s`: for how long the run has not answered; all else is then
+    as before.
     """
 
     status: dict[str, object]
@@ -89,6 +91,7 @@ class Snapshot(msgspec.Struct, frozen=True):
     processes: list[ProcessRow]
     frames_s: float | None
     load_percent: float | None
+    blackout_ms: float | None
     events: list[dict[str, object]]
     silent_s: float = 0.0
 
@@ -201,6 +204,14 @@ class RunConnection:
         time.sleep(PERIOD_S)
 
 
+class Looked(NamedTuple):
+    """What a snapshot has of the graph: its nodes, the processes of those that live, the last blackout."""
+
+    nodes: dict[str, tuple[str, ...]]
+    processes: list[ProcessRow]
+    blackout_ms: float | None
+
+
 class RunWatcher:
     """Looks at the run for all pages at once."""
 
@@ -224,7 +235,7 @@ class RunWatcher:
                 self._run.await_start()
             record = Path(str(self._run.ask(control_client.StatusQuery())["record"]))
             events, bus = GrowingFile(record / EVENT_LOG_NAME), BusMeter(record / BUS_NAME)
-            nodes, processes = dict[str, tuple[str, ...]](), list[ProcessRow]()
+            graph = Looked({}, [], None)
             looked_s = changed_s = -math.inf
             while True:
                 if self._pages:
@@ -233,10 +244,11 @@ class RunWatcher:
                     if lines:
                         changed_s = now_s
                     if now_s - changed_s < LOOK_S or now_s - looked_s >= LOOK_S:
-                        nodes, processes = self._look()
-                        looked_s = now_s
+                        graph, looked_s = self._look(), now_s
                     bus.read(status.get("bitrate_bps"))
-                    self._tell(Snapshot(status, nodes, processes, bus.frames_s, bus.load_percent, []), lines)
+                    self._tell(
+                        Snapshot(status, *graph[:2], bus.frames_s, bus.load_percent, graph[2], []), lines
+                    )
                 with self._changed:
                     if not self._pages:
                         self._changed.wait(IDLE_S)
@@ -249,11 +261,12 @@ class RunWatcher:
         finally:
             self._run.close()
 
-    def _look(self) -> tuple[dict[str, tuple[str, ...]], list[ProcessRow]]:
-        """The nodes of the graph, and the processes of those that live."""
+    def _look(self) -> Looked:
         graph = msgspec.convert(self._run.ask(control_client.GraphQuery()), Graph)
         rows = control_client.process_rows(self._run.ask(control_client.ProcessesQuery()))
-        return graph.nodes, [row for row in rows if row.node]
+        ended = self._run.ask(control_client.AdaptationsQuery())["adaptations"]
+        blackouts = [one.blackout_ms for one in msgspec.convert(ended, list[Outcome])]
+        return Looked(graph.nodes, [row for row in rows if row.node], blackouts[-1] if blackouts else None)
 
     def _tell(self, snapshot: Snapshot, lines: Sequence[bytes] = ()) -> None:
         with self._changed:

@@ -1,8 +1,7 @@
 """A campaign at the terminal: its progress while it runs, and its summary at the end.
 
-While it runs, a terminal shows one picture that is redrawn in place: progress, rate, time left, and a line
-per stratum. Anything else (a pipe, the log of a CI) gets a plain line now and then. `add` redraws the
-picture, not a thread: a thread would be forked with the processes that do the experiments.
+While it runs, a terminal shows one picture that is redrawn in place: the line of `progress`, and one for each
+stratum. Anything else (a pipe, the log of a CI) gets the plain lines of `progress`.
 """
 
 import sys
@@ -27,16 +26,16 @@ from aftbed.campaign.summary import (
 from aftbed.campaign.weaknesses import SeenPlace, Weakness
 from aftbed.core.errors import shown
 from aftbed.judge.outcome import OUTCOMES
+from aftbed.report.progress import REDRAW_S, ProgressLine, pace
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.live import Live
 
-REDRAW_S: Final = 0.1
-LINE_S: Final = 10.0  # between two plain lines
 PLACES_MAX: Final = 6  # of a weakness, listed
 ROWS_MAX: Final = 30  # strata in the picture
 BAR: Final = 30  # characters
+UNIT: Final = "experiments"
 STYLES: Final = {  # of outcomes; all others are red
     "masked": "green",
     "latent": "yellow",
@@ -191,8 +190,9 @@ def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
 class CampaignProgress:
     """A context manager; `add` takes each result. There are at most `total` experiments."""
 
-    def __init__(self, campaign: str, total: int, *, quiet: bool = False) -> None:
-        self._campaign, self._total, self._quiet = campaign, total, quiet
+    def __init__(self, campaign: str, total: int, *, plain: bool = True) -> None:
+        self._campaign, self._total = campaign, total
+        self._lines = ProgressLine(f"campaign {campaign}", total, UNIT, plain=plain)
         self._began_s = self._shown_s = time.monotonic()
         self._done = self._unexpected = 0
         self._outcomes = Counter[str]()
@@ -200,11 +200,25 @@ class CampaignProgress:
         self._live: Live | None = None
 
     def __enter__(self) -> Self:
-        if not self._quiet and sys.stdout.isatty():
-            from rich.live import Live  # noqa: PLC0415 - for a terminal only
+        if sys.stderr.isatty():
+            from rich.console import Console  # noqa: PLC0415 - for a terminal only
+            from rich.live import Live  # noqa: PLC0415
 
-            self._live = Live(get_renderable=self._picture, auto_refresh=False, transient=True)
-            self._live.start(refresh=True)
+            console = Console(stderr=True)
+            live = Live(
+                get_renderable=self._picture,
+                console=console,
+                auto_refresh=False,
+                transient=True,
+                redirect_stdout=False,
+                redirect_stderr=False,
+            )
+            try:
+                live.start(refresh=True)
+            except BaseException:
+                live.stop()
+                raise
+            self._live = live
         return self
 
     def __exit__(
@@ -219,27 +233,15 @@ class CampaignProgress:
         self._unexpected += result.unexpected
         self._outcomes[result.outcome] += 1
         self._strata.setdefault(result.experiment.stratum, Counter())[result.outcome] += 1
-        now_s = time.monotonic()
-        period_s = REDRAW_S if self._live is not None else LINE_S
-        if self._quiet or now_s < self._shown_s + period_s:
-            return
-        self._shown_s = now_s
-        if self._live is not None:
+        if self._live is None:
+            self._lines.show(self._done, note=self._counts())
+        elif (now_s := time.monotonic()) >= self._shown_s + REDRAW_S:
+            self._shown_s = now_s
             self._live.refresh()
-        else:
-            print(self.line(), flush=True)
 
-    def line(self) -> str:
-        """The progress in one line."""
+    def _counts(self) -> str:
         counts = ", ".join(f"{name} {self._outcomes[name]}" for name in OUTCOMES if self._outcomes[name])
-        unexpected = f"; {self._unexpected} unexpected" if self._unexpected else ""
-        return f"{self._pace()}: {counts}{unexpected}"
-
-    def _pace(self) -> str:
-        rate = self._done / max(time.monotonic() - self._began_s, 1e-9)
-        left_s = (self._total - self._done) / rate if self._done else 0.0
-        left = f", {_clock(left_s)} left" if 0 < self._done < self._total else ""
-        return f"{self._done} of {self._total}, {rate:.3g}/s{left}"
+        return counts + (f"; {self._unexpected} unexpected" if self._unexpected else "")
 
     def _picture(self) -> "RenderableType":
         from rich.console import Group  # noqa: PLC0415
@@ -248,7 +250,7 @@ class CampaignProgress:
 
         full = BAR * self._done // max(1, self._total)
         head = Text.assemble((self._campaign, "bold"), "  ", ("━" * full, "green"), "━" * (BAR - full), "  ")
-        head.append(self._pace())
+        head.append(pace(self._done, self._total, time.monotonic() - self._began_s, UNIT))
         head.append(f"  {self._unexpected} unexpected" if self._unexpected else "", "bold red")
         table = Table(box=None, pad_edge=False, show_header=False)
         for name, counts in list(self._strata.items())[:ROWS_MAX]:
@@ -256,9 +258,3 @@ class CampaignProgress:
             table.add_row(Text(name), str(counts.total()), Text.assemble(*words))
         more = len(self._strata) - ROWS_MAX
         return Group(head, table, Text(f"and {more} more strata" if more > 0 else ""))
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

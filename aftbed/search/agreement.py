@@ -8,7 +8,8 @@ real ones. Where they do not, the report has the reason; what is left out here i
 """
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -16,6 +17,7 @@ import msgspec
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Scheduled
+from aftbed.core.progress import Show, unshown
 from aftbed.functions.load import OWN_CODE
 from aftbed.functions.request_file import GivenRequests
 from aftbed.judge import checks
@@ -24,7 +26,7 @@ from aftbed.judge.outcome import outcome_of
 from aftbed.judge.record import RunRecord, read_record
 from aftbed.judge.simulated import evidence_of_run
 from aftbed.judge.verdict import evidence_of
-from aftbed.runtime.sim.world import Setup, simulate
+from aftbed.runtime.sim.world import Run, Setup, simulate
 from aftbed.runtime.unix.options import CarRun, LoadRun
 from aftbed.runtime.unix.trust import NOBODY, Trust, vetted
 
@@ -51,8 +53,10 @@ class Agreement(msgspec.Struct, frozen=True):
     why_not: tuple[str, ...]
 
 
-def against(paths: Iterable[Path], seeds: int = SEEDS, trust: Trust = NOBODY) -> list[Agreement]:
-    """Compare the records in `paths`.
+def against(
+    paths: Iterable[Path], seeds: int = SEEDS, trust: Trust = NOBODY, show: Show = unshown
+) -> list[Agreement]:
+    """Compare the records in `paths`; `show` gets how many of the simulations are done.
 
     Raises ConfigError where one is none, cannot be simulated, or names a function that is not trusted.
     """
@@ -62,7 +66,14 @@ def against(paths: Iterable[Path], seeds: int = SEEDS, trust: Trust = NOBODY) ->
         if record.options.application:
             vetted(record.options.application, trust)
         groups.setdefault(setup_of(record), []).append(record)
-    return [_compare(setup, records, seeds, trust) for setup, records in groups.items()]
+    return [
+        _compare(setup, records, seeds, trust, partial(_shown, show, number * seeds, len(groups) * seeds))
+        for number, (setup, records) in enumerate(groups.items())
+    ]
+
+
+def _shown(show: Show, before: int, total: int, done: int) -> None:
+    show(before + done, total)
 
 
 def setup_of(record: RunRecord) -> Setup:
@@ -96,10 +107,16 @@ def _given(record: RunRecord, source: str) -> GivenRequests:
     return GivenRequests(source, record.given)
 
 
-def _compare(setup: Setup, records: list[RunRecord], seeds: int, trust: Trust) -> Agreement:
-    runs = (simulate(msgspec.structs.replace(setup, seed=seed), OWN_CODE) for seed in range(seeds))
+def _compare(
+    setup: Setup, records: list[RunRecord], seeds: int, trust: Trust, show: Callable[[int], None]
+) -> Agreement:
+    def simulated() -> Iterator[Run]:
+        for seed in range(seeds):
+            yield simulate(msgspec.structs.replace(setup, seed=seed), OWN_CODE)
+            show(seed + 1)
+
     real_classes, real_times = _summed(evidence_of(record, trust=trust) for record in records)
-    sim_classes, sim_times = _summed(evidence_of_run(run, OWN_CODE) for run in runs)
+    sim_classes, sim_times = _summed(evidence_of_run(run, OWN_CODE) for run in simulated())
     found = [
         f"no seed ends {word}, as {n} real runs do"
         for word, n in real_classes.items()

@@ -49,7 +49,7 @@ from aftbed.inject.targets import Roles, emitting_node
 from aftbed.judge.checks import VEHICLE
 from aftbed.judge.simulated import breaches
 from aftbed.runtime.sim.world import Run, Setup, World, simulate
-from aftbed.runtime.unix import linux
+from aftbed.runtime.unix import interrupts, linux
 from aftbed.vehicle.aeb.messages import STAGE_NONE, decode_reply, decode_request
 from aftbed.vehicle.plant import VehicleResult
 
@@ -202,7 +202,7 @@ def branched(course: Course, branches: Iterable[Branch], over_ms: float) -> Iter
 def _branch(world: World, fault: Fault, last_ns: int) -> BranchOutcome:
     """In a copy of this process, which dies with it."""
     reader, writer = os.pipe()
-    parent, pid = os.getpid(), os.fork()
+    parent, pid = os.getpid(), interrupts.fork()
     if pid == 0:
         try:
             linux.die_with(parent)

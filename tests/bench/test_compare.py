@@ -276,7 +276,7 @@ def test_the_exit_code_says_whether_the_new_version_is_above_the_ratio(
     words = ["bench", "compare", str(old), str(new), "--bench", "cycle", "--max-ratio"]
     above_it = called(*words, "1.05", "--rounds", "6")
     assert above_it.code == 1 and "ratio 1.2 (1.2 to 1.2)  rounds 6  slower" in above_it.out, above_it.err
-    assert f"measuring: {old}: aftbed bench cycle, round 1 of 6" in above_it.err
+    assert f"bench compare: 0 of 12 measurements; {old}: aftbed bench cycle, round 1 of 6" in above_it.err
     too_few = called(*words, "1.05", "--rounds", "1", "--json")
     assert too_few.code == 0 and json.loads(too_few.out)["changes"][0]["verdict"] == "not enough rounds"
     assert called(*words, "0").err.endswith("--max-ratio 0: more than 0 is allowed, 1.05 for 5 % slower\n")

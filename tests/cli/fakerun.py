@@ -62,6 +62,8 @@ class FakeRun:
             case control_client.InjectCommand(fault):
                 self.faults.append(fault)
                 return {}
+            case control_client.StopCommand():
+                return {"stopping": True}
             case control_client.AdaptationsQuery():
                 return {"adaptations": self.history}
             case control_client.PlanQuery(goal):

@@ -43,10 +43,14 @@ def test_the_help_of_all_commands_imports_no_command() -> None:
         "aftbed",
         "aftbed.cli",
         "aftbed.cli.app",
+        "aftbed.cli.interrupted",
         "aftbed.cli.lazy",
         "aftbed.cli.parsing",
         "aftbed.core",
         "aftbed.core.errors",
+        "aftbed.runtime",
+        "aftbed.runtime.unix",
+        "aftbed.runtime.unix.interrupts",
     }
     assert not modules & {
         "pydantic",

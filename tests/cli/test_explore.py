@@ -248,5 +248,7 @@ class Interrupted:
 def test_ctrl_c_ends_every_explorer_with_130(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, command in (("explore_all", "crash"), ("explore_orders", "order")):
         monkeypatch.setattr(f"aftbed.cli.explore.{name}", lambda *_, **__: Interrupted())
-        code, out, _ = call("explore", command, "--ftm", "pbr", "--placement", "process", "--requests", "1")
-        assert code == 130 and "interrupted: 0 of " in out
+        words = ("explore", command, "--ftm", "pbr", "--placement", "process", "--requests", "1")
+        code, out, err = call(*words)
+        assert code == 130 and err.startswith("aftbed: interrupted: 0 of ") and "nothing is kept" in err
+        assert out.splitlines()[-1].startswith("0 of 0 ")

@@ -560,7 +560,9 @@ def test_a_disagreement_is_exit_code_1(
     sim: Call, monkeypatch: pytest.MonkeyPatch, why_not: tuple[str, ...], code: int
 ) -> None:
     one = Agreement("pbr process", {"masked": 1}, {"masked": 20}, FAST, None, why_not)
-    monkeypatch.setattr("aftbed.cli.sim.against", lambda records, seeds, trust: [one] if seeds == 3 else [])
+    monkeypatch.setattr(
+        "aftbed.cli.sim.against", lambda records, seeds, trust, show: [one] if seeds == 3 else []
+    )
     found, out, _ = sim("--against", str(Path("there")), "--seeds", "0..2", "--json")
     assert (found, json.loads(out)["agree"]) == (code, not why_not)
 

@@ -13,6 +13,7 @@ from requestpath import REQUEST_PATH
 
 from aftbed.cli import EXIT_READER_GONE, EXIT_USAGE
 from aftbed.cli.app import app
+from aftbed.cli.interrupted import EXIT_INTERRUPTED
 from aftbed.cli.lazy import LazyCommand
 from aftbed.core.events import BY_LABEL
 from aftbed.core.graph import PLACEMENTS
@@ -20,7 +21,7 @@ from aftbed.ftm.compose import EXPRESSIONS, build
 from aftbed.ftm.registry import EMITTERS
 from aftbed.inject import targets
 from aftbed.interop.logs import EXTENDED, FD, FrameKind
-from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED
+from aftbed.judge.verdict import EXIT_CODES
 from aftbed.vehicle.can.candump import Refusal
 from aftbed.vehicle.can.dbc_file import load_dbc
 from aftbed.vehicle.ecus import BRAKE_POLICIES

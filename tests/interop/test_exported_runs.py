@@ -125,7 +125,7 @@ def frame(t_us: int, name: str, broken: bool = False, **signals: float) -> str:
 def mcap_of(record: RunRecord) -> dict[str, list[tuple[int, dict[str, Any]]]]:
     """What the reader of the format finds: time and message, by topic."""
     path = record.path / "run.mcap"
-    lines = export(record, ExportFiles(mcap=path))
+    lines = list(map(str, export(record, ExportFiles(mcap=path))))
     found: dict[str, list[tuple[int, dict[str, Any]]]] = {}
     times = []
     with path.open("rb") as file:

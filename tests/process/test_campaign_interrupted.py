@@ -14,7 +14,7 @@ from liveruns import GONE_SECONDS_MAX, WAIT_SECONDS_MAX, Home, until
 from sampling import every
 
 from aftbed.campaign import ledger
-from aftbed.judge.verdict import EXIT_INTERRUPTED
+from aftbed.cli.interrupted import EXIT_INTERRUPTED
 from aftbed.runtime.unix.worker_pool import RUN_END_SECONDS_MAX
 
 pytestmark = pytest.mark.process
@@ -81,11 +81,20 @@ MOMENTS: dict[str, Callable[[Interrupted], bool]] = {
 }
 
 
+def check_end(code: int, errors: str, out: Path) -> None:
+    """What is kept of it, and how to go on: nothing else."""
+    assert code == EXIT_INTERRUPTED
+    last = errors.splitlines()[-1]
+    assert last.startswith("aftbed: interrupted: ") and f"experiments are kept in {out}; go on: " in last
+    assert f"--out {out} --jobs {JOBS} --resume; reports: aftbed campaign report {out}" in last
+    assert "Traceback" not in errors
+
+
 @pytest.mark.parametrize("moment", every(3, tuple(MOMENTS)))
 def test_it_ends_and_nothing_is_left(campaign: Interrupted, moment: str) -> None:
     until(lambda: MOMENTS[moment](campaign), moment)
     campaign.interrupt()
-    assert campaign.end() == (EXIT_INTERRUPTED, "interrupted: --resume goes on from here\n")
+    check_end(*campaign.end(), campaign.out)
     assert campaign.home.seconds_to_clean() < GONE_SECONDS_MAX
 
 
@@ -99,6 +108,6 @@ def test_another_interrupt_does_not_wait_for_what_is_under_way(campaign: Interru
     until(lambda: campaign.pipes() < pipes, "it to end its workers")
     began_s = time.monotonic()
     campaign.interrupt()
-    assert campaign.end() == (EXIT_INTERRUPTED, "interrupted: --resume goes on from here\n")
+    check_end(*campaign.end(), campaign.out)
     assert time.monotonic() - began_s < RUN_END_SECONDS_MAX / 2
     assert campaign.home.seconds_to_clean() < GONE_SECONDS_MAX

@@ -13,7 +13,7 @@ from campaigns import result
 from reported import summary_of, with_results
 
 from aftbed.campaign.ledger import Ledger
-from aftbed.report import terminal
+from aftbed.report import progress as progress_of_any
 from aftbed.report.terminal import CampaignProgress, summary_lines
 
 
@@ -57,29 +57,19 @@ def test_what_is_missing_is_said(ledger: Ledger) -> None:
     assert summary_lines(summary_of(with_results(ledger)))[-1] == "gate: fail"
 
 
-def test_plain_lines_where_stdout_is_no_terminal(
+def test_plain_lines_where_standard_error_is_no_terminal(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(terminal, "LINE_S", 0.0)
+    monkeypatch.setattr(progress_of_any, "LINE_S", 0.0)
     with CampaignProgress("try", 3) as progress:
         progress.add(result("tolerated"))
         progress.add(result("sdc", index=1, unexpected=True))
-    first, second = capsys.readouterr().out.splitlines()
-    assert first.startswith("1 of 3, ") and first.endswith(" left: tolerated 1")
-    assert second.startswith("2 of 3, ") and second.endswith(": tolerated 1, sdc 1; 1 unexpected")
-
-
-def test_quiet_is_quiet(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(terminal, "LINE_S", 0.0)
-    with CampaignProgress("try", 1, quiet=True) as progress:
-        progress.add(result())
-    assert capsys.readouterr().out == ""
-
-
-def test_no_lines_before_it_is_time(capsys: pytest.CaptureFixture[str]) -> None:
-    with CampaignProgress("try", 1) as progress:
-        progress.add(result())
-    assert capsys.readouterr().out == ""
+    out, err = capsys.readouterr()
+    first, second = err.splitlines()[-2:]
+    assert out == ""
+    assert first.startswith("campaign try: 1 of 3 experiments, ") and first.endswith(" left; tolerated 1")
+    assert second.startswith("campaign try: 2 of 3 experiments, ")
+    assert second.endswith("; tolerated 1, sdc 1; 1 unexpected")
 
 
 LIVE = """
@@ -100,7 +90,9 @@ def test_a_terminal_gets_a_picture_that_goes_away() -> None:
     master, slave = pty.openpty()
     code = LIVE.format(folder=str(Path(__file__).resolve().parents[1] / "campaign"))
     environment = os.environ | {"TERM": "xterm", "COLUMNS": "120", "LINES": "60"}
-    child = subprocess.Popen([sys.executable, "-c", code], stdout=slave, stderr=slave, env=environment)
+    child = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=slave, env=environment
+    )
     os.close(slave)
     seen = io.BytesIO()
     while data := _read(master):
@@ -108,7 +100,7 @@ def test_a_terminal_gets_a_picture_that_goes_away() -> None:
     os.close(master)
     assert child.wait(60) == 0, seen.getvalue().decode()
     said = seen.getvalue().decode()
-    assert "40 of 40" in said and "1 unexpected" in said and "pbr 0" in said
+    assert "40 of 40 experiments" in said and "1 unexpected" in said and "pbr 0" in said
     assert "and 10 more strata" in said and "\x1b[1A" in said
 
 

@@ -12,6 +12,7 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import ConfigError
+from aftbed.core.progress import Show, unshown
 from aftbed.interop.openscenario.catalog import Catalogs
 from aftbed.interop.openscenario.document import Cause, RefusedError
 from aftbed.interop.openscenario.importer import (
@@ -47,9 +48,10 @@ class FileReport(msgspec.Struct, frozen=True):
 
 
 def import_folder(
-    folder: Path, options: ImportOptions, out: Path | None, *, force: bool
+    folder: Path, options: ImportOptions, out: Path | None, *, force: bool, show: Show = unshown
 ) -> Iterator[FileReport]:
     """Import the files of `folder` in the order of their paths; a report of each as it is done.
+    `show` gets how many files are done.
 
     With `out` the scenarios are written, in folders like those of the files. Raises ConfigError if there is
     no file, an option is wrong, or a scenario cannot be written.
@@ -64,7 +66,8 @@ def import_folder(
     if len(paths) > FILES_MAX:
         raise ConfigError(f"{folder}: {len(paths)} files, allowed are {FILES_MAX}; import a part of it")
     catalogs = Catalogs()
-    for path in paths:
+    for number, path in enumerate(paths):
+        show(number, len(paths))
         place = path.relative_to(folder)
         try:
             imported = import_scenario(path, None, options, catalogs)

@@ -19,6 +19,8 @@ from contextlib import suppress
 from select import POLLIN, poll
 from typing import Final, NoReturn
 
+from aftbed.runtime.unix import interrupts
+
 END_SECONDS_MAX: Final = 0.8  # G7 allows 1 s
 WORDS_WITHOUT_BUS: Final = ("--load", "--requests")
 _begun: Final[list["Start"]] = []  # at most one
@@ -46,7 +48,7 @@ def fork(supervise: Callable[[socket.socket], object]) -> Start:
     """Fork the child, which calls `supervise` with its end of the line. Raises OSError."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with theirs:
-        pid = os.fork()
+        pid = interrupts.fork()
         if pid == 0:
             try:
                 ours.close()

@@ -31,7 +31,7 @@ from aftbed.ftm.compose import parse
 from aftbed.ftm.registry import packages_of
 from aftbed.inject.model import Fault
 from aftbed.runtime import control
-from aftbed.runtime.unix import head_start, linux, run_directory, seal
+from aftbed.runtime.unix import head_start, interrupts, linux, run_directory, seal
 from aftbed.runtime.unix.cleanup import watch
 from aftbed.runtime.unix.code_version import code_version
 from aftbed.runtime.unix.journal_files import CHUNK_BYTES, trim
@@ -145,7 +145,7 @@ class Launched:
         self._pidfd = os.pidfd_open(self.supervisor)
         self._hand_over((supervisor_life, waker), listener, log)
         os.close(supervisor_life)
-        self.warden = os.fork()
+        self.warden = interrupts.fork()
         if self.warden == 0:
             try:
                 linux.continue_at_parents_death()
@@ -311,9 +311,14 @@ def launch(
 
     Raises ConfigError, leaving nothing, where it cannot be started.
     """
+    launched = None
     try:
-        return Launched(options, listener, given, log)
+        with interrupts.uninterrupted():  # a run with its directory and its warden, or none
+            launched = Launched(options, listener, given, log)
+        return launched  # noqa: RET504 - an interrupt that comes before it finds the run
     except BaseException as error:
+        if launched is not None:
+            launched.remove()
         record = Path(options.record)
         if record.parent != Path(options.private):
             shutil.rmtree(record, ignore_errors=True)
@@ -349,6 +354,7 @@ def options_for(
     `evidence`: the options say which code this is, also of a run that verifies nothing and is not kept.
     """
     faults = tuple(with_names_resolved(fault, work) for fault in faults)
+    goals = tuple(one.goal.expression for one in adaptations if one.goal.expression)
     drive = _scenario(work) if isinstance(work, CarRun) else None
     verifies = tuple(dict.fromkeys((*verifies, *(drive.verifies if drive is not None else ()))))
     ensure_limits()
@@ -380,7 +386,7 @@ def options_for(
         ftti_ms=ftti_ms,
         verifies=verifies,
         command=command,
-        packages=(packages := packages_of(parse(ftm))),
+        packages=(packages := packages_of(name for one in (ftm, *goals) for name in parse(one))),
         code=code_version(packages) if evidence or verifies or record is not None else "",
     )
     return options, listener

@@ -12,12 +12,12 @@ import hashlib
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Final
 
 import msgspec
 
 from aftbed.core.input_file import open_input, read_input
+from aftbed.runtime.unix.interrupts import scratch_directory
 from aftbed.runtime.unix.journal_files import trim
 
 NAME: Final = "seal.json"
@@ -45,8 +45,8 @@ def write(record: Path) -> None:
 def copy_sealed(record: Path, target: Path) -> None:
     """Make `target`, a sealed copy of the record of a run that has ended, whole or not. Raises OSError."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
-        beside = Path(folder) / target.name
+    with scratch_directory(f".{target.name}.", target.parent) as folder:
+        beside = folder / target.name
         shutil.copytree(record, beside, symlinks=True)
         trim(beside / "journal")
         write(beside)

@@ -6,7 +6,8 @@ experiment that hangs, or whose worker dies, is reported with the command that r
 
 Pools of the standard library know neither, and one that is interrupted while it starts a process may wait
 for it for ever. Here an interrupt ends all at any moment: each worker finishes its experiment, so that its
-run is taken down in order. A second interrupt kills them.
+run is taken down in order. What takes longer than END_SECONDS_MAX is killed, and the warden of its run cleans
+up. A second interrupt kills them at once.
 
 A worker is a fork, or a fresh interpreter (`python -m`). Little is imported here, above all not
 `threading`, nor `multiprocessing`, which needs it: the nodes of a real run are forks of a fresh worker, and
@@ -21,19 +22,19 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import contextmanager
 from select import POLLIN, poll
 from typing import Any, Final, NoReturn, TypeVar, cast
 
 from aftbed.core.errors import HarnessError
-from aftbed.runtime.unix import linux
+from aftbed.runtime.unix import interrupts, linux
+from aftbed.runtime.unix.interrupts import uninterrupted
 
 AHEAD: Final = 32  # experiments for each worker that may be done before the oldest is
 SECONDS_MAX: Final = 900.0  # of one: it takes seconds, on a busy machine a minute
 OWN_SECONDS_MAX: Final = 60.0  # of a simulated one that executes a function of the user, and for each request
 OWN_REQUEST_SECONDS_MAX: Final = 0.01
 RUN_END_SECONDS_MAX: Final = 30.0  # when the command ends: a real run is taken down in order
-END_SECONDS_MAX: Final = 1.0  # of a worker without real runs, whatever ends it
+END_SECONDS_MAX: Final = 0.5  # of a worker without real runs, or of any behind an interrupt
 TALK_SECONDS_MAX: Final = 60.0  # for a message to be sent or received once it has begun
 SETUP_MAX: Final = 300  # characters of an experiment in an error
 SIZE_BYTES: Final = 8
@@ -222,7 +223,7 @@ class _Pool:
 
     def leave(self, number: int) -> None:
         """End the worker that has experiment `number`."""
-        with _uninterrupted():
+        with uninterrupted():
             for worker in [worker for worker in self._workers if worker.number == number]:
                 self._workers.remove(worker)
                 worker.pipe.close()
@@ -233,12 +234,13 @@ class _Pool:
         try:
             for worker in self._workers:
                 worker.pipe.close()
-            limit_s = time.monotonic() + (RUN_END_SECONDS_MAX if self._fresh else END_SECONDS_MAX)
+            in_order = self._fresh and not interrupts.came()
+            limit_s = time.monotonic() + (RUN_END_SECONDS_MAX if in_order else END_SECONDS_MAX)
             left = {worker.pidfd for worker in self._workers}
             while left and (ended := _ready(left, max(0.0, limit_s - time.monotonic()))):
                 left -= ended
         finally:
-            with _uninterrupted():
+            with uninterrupted():
                 while self._workers:
                     self._workers.pop().end()
 
@@ -246,7 +248,7 @@ class _Pool:
         ours, theirs = socket.socketpair()
         ours.settimeout(TALK_SECONDS_MAX)
         command = os.getpid()
-        with theirs, _uninterrupted():
+        with theirs, uninterrupted():
             if self._fresh:
                 pid = linux.start_interpreter(__name__, theirs.fileno(), str(command))
             elif (pid := os.fork()) == 0:
@@ -263,29 +265,6 @@ def _ready(fds: Iterable[int], seconds: float) -> set[int]:
     for fd in fds:
         found.register(fd, POLLIN)
     return {fd for fd, _ in found.poll(seconds * 1e3)}
-
-
-@contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """An interrupt is raised only after it; a process that is started in it receives none.
-
-    The mask is for this thread and for that process. The handler is for interrupts that the kernel gives to
-    another thread of this process (libraries have some): Python would raise them here all the same.
-    """
-    came: list[int] = []
-    try:
-        handler = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
-    except ValueError:  # not the main thread: interrupts are not for it
-        yield
-        return
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        signal.signal(signal.SIGINT, handler)
-        if came:
-            signal.raise_signal(signal.SIGINT)
 
 
 # -- in the worker --------------------------------------------------------------------------------

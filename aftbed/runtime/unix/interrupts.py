@@ -1,0 +1,88 @@
+"""Ctrl-C: what must not be cut short by it, and whether it came.
+
+An interrupt is a KeyboardInterrupt wherever the command is. A second one may come while the command cleans up
+behind the first: what removes files or starts processes is done in `uninterrupted`.
+"""
+
+import contextlib
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+
+_came: list[int] = []
+
+
+def listen() -> None:
+    """Count the interrupts of this process; where they are ignored, as behind `&`, they stay so."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
+
+
+def ignore() -> None:
+    """From now on; for a process that is about to end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def came() -> bool:
+    """Whether this command was interrupted; False in a process that does not `listen`."""
+    return bool(_came)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    _came.append(number)
+    raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """An interrupt is raised only after it; a process that is started in it receives none, then or later.
+
+    The mask is for this thread and for that process. The handler is for interrupts that the kernel gives to
+    another thread of this process (libraries have some): Python would raise them here all the same.
+    """
+    came: list[int] = []
+    command = os.getpid()
+    try:
+        handler = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    except ValueError:  # not the main thread: interrupts are not for it
+        yield
+        return
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        if os.getpid() != command:
+            ignore()
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        else:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+            signal.signal(signal.SIGINT, handler)
+            if came:
+                signal.raise_signal(signal.SIGINT)
+
+
+def fork() -> int:
+    """As os.fork(2), but that the child leaves interrupts to this process, from its first moment on."""
+    with uninterrupted():
+        return os.fork()
+
+
+@contextlib.contextmanager
+def scratch_directory(prefix: str, folder: Path | None = None) -> Iterator[Path]:
+    """A new directory, in `folder` or where temporary files are, which is removed whatever interrupts."""
+    import tempfile  # noqa: PLC0415 - workers import this module, and need none
+
+    with contextlib.ExitStack() as standing:
+        with uninterrupted():
+            path = Path(tempfile.mkdtemp(prefix=prefix, dir=folder))
+            standing.callback(_remove, path)
+        yield path
+
+
+def _remove(path: Path) -> None:
+    import shutil  # noqa: PLC0415 - the same
+
+    with uninterrupted():
+        shutil.rmtree(path, ignore_errors=True)
