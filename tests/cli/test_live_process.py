@@ -244,7 +244,7 @@ def test_a_run_is_steered_by_keys(home: Home) -> None:
 def test_a_run_can_end_while_its_command_is_suspended(home: Home, tmp_path: Path) -> None:
     """More is reported than fits, and nothing reads it; how it ended comes through."""
     drive = CarRun("free-drive", None, "latch", duration_ms=20_000)
-    with Started(home, drive, placement="replica", record=tmp_path / "record") as run:
+    with Started(home, drive, ftm="none", placement="replica", record=tmp_path / "record") as run:
         assert ended(run.launched.supervisor, RUN_SECONDS_MAX)
         done = run.finish()
     assert run.launched.end is not None
