@@ -46,6 +46,9 @@ Junit = Annotated[Path | None, typer.Option(help="Write the verdict to this file
 VERIFIES: Final = "--verifies"
 VERIFIES_HELP: Final = "A requirement, as SG-1, that the run verifies; may be given several times."
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
+Quiet = Annotated[
+    bool, typer.Option("--quiet", "-q", help="Print the verdict and its reasons, and nothing else.")
+]
 Ftm = Annotated[str, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...: aftbed ftm list.")]
 Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
 TrustedFolders = Annotated[

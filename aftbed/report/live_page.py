@@ -42,14 +42,14 @@ from urllib.parse import parse_qs, urlsplit
 
 import msgspec
 
-from aftbed.core.errors import AftbedError
+from aftbed.core.errors import AftbedError, ConfigError
 from aftbed.core.graph import Graph
 from aftbed.ftm.compose import expressions
-from aftbed.judge.timeline import EVENT_LOG_NAME
+from aftbed.report.steering import ANSWER_CHARACTERS_MAX, COMMAND_S_MAX, child_command
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.unix import control_client, linux, run_directory
 from aftbed.runtime.unix.control_client import ProcessRow
-from aftbed.runtime.unix.run_directory import BUS_NAME
+from aftbed.runtime.unix.run_directory import BUS_NAME, EVENT_LOG_NAME
 from aftbed.runtime.unix.transport import Line
 from aftbed.vehicle.can.bus_load import load_percent, logged_frame
 from aftbed.vehicle.can.hub import user_behind
@@ -64,15 +64,12 @@ LAST_S_MAX: Final = 0.2  # that the pages may take to read the end
 END_S_MAX: Final = 0.9  # from the end of the run to that of the server
 CONNECTIONS_MAX: Final = 16
 COMMANDS_MAX: Final = 2  # at once
-COMMAND_S_MAX: Final = 20.0
 COMMAND_BYTES_MAX: Final = 1000
-ANSWER_CHARACTERS_MAX: Final = 4000
 SEND_S_MAX: Final = 5.0  # that a browser may take to read, or to send its request
 EVENTS_KEPT: Final = 500
 READ_BYTES_MAX: Final = 1_000_000  # of a log, at once
 NICE: Final = 10
 TOKEN_VARIABLE: Final = "AFTBED_PAGE_TOKEN"  # not an argument: other users can read those
-COMMANDS: Final = ("adapt", "inject", "stop")  # what the page may ask for
 POLICY: Final = (
     "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; connect-src 'self';"
     " img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -440,17 +437,16 @@ class PageRequest(BaseHTTPRequestHandler):
 def carry_out(words: str, private: Path, at_once: threading.Semaphore) -> tuple[int, str]:
     """The exit code and the output of `aftbed WORDS` for this run, as at a second terminal."""
     try:
-        first, *others = shlex.split(words) or [""]
+        command = child_command(shlex.split(words), private)
     except ValueError:
         return 2, f"{words}: quotation marks come in pairs"
-    if first not in COMMANDS:
-        return 2, f"{first or 'nothing'}: {', '.join(COMMANDS)} are allowed here"
+    except ConfigError as error:
+        return 2, str(error)
     if not at_once.acquire(blocking=False):
         return 2, f"{COMMANDS_MAX} commands are under way: wait for one of them"
     try:
-        command = [sys.executable, "-m", "aftbed.cli.child", str(os.getpid()), first, *others]
         done = subprocess.run(
-            [*command, "--run", private.name],
+            command,
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,

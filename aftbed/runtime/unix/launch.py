@@ -222,7 +222,7 @@ class Launched:
             report, _ = got
             if isinstance(report, control.Report):
                 match report.kind:
-                    case "finished":
+                    case control.FINISHED:
                         self.end = msgspec.json.decode(report.data)
                     case "trouble":
                         self.trouble = report.data.decode()
