@@ -67,7 +67,8 @@ def test_two_rules_that_contradict_each_other_are_both_named(
         read(tmp_path, *rules)
     text = str(error.value)
     assert reason in text
-    assert text.startswith(f"{tmp_path}/mine.yaml: rules[0] (") and " and rules[1] (" in text
+    assert text.startswith(f"{tmp_path}/mine.yaml: line 4, column 5: rules[1]: rules[0] (")
+    assert " and rules[1] (" in text
     assert f": {first[1]})" in text and f": {second[1]})" in text
 
 

@@ -96,8 +96,8 @@ def test_the_expressions_are_all_of_one_and_two_mechanisms_that_make_sense() -> 
     )
 
 
-@pytest.mark.parametrize(("typed", "meant"), [("PBR", "pbr"), ("Lfr+TR", "lfr+tr"), ("NONE", "none")])
-def test_capitals_are_no_other_name(typed: str, meant: str) -> None:
+@pytest.mark.parametrize(("typed", "meant"), [("PBR", "pbr"), ("Lfr + TR", "lfr+tr"), ("NONE", "none")])
+def test_capitals_and_spaces_make_no_other_name(typed: str, meant: str) -> None:
     assert canonical(typed) == meant
     assert build(typed, "process") == build(meant, "process")
 
@@ -108,7 +108,7 @@ def test_capitals_are_no_other_name(typed: str, meant: str) -> None:
         ("prb", "unknown FTM 'prb'; did you mean 'pbr'? (one of: assert, lfr, none, pbr, sup, tr)"),
         ("", "unknown FTM '' (one of: "),
         ("pbr+", "unknown FTM '' (one of: "),
-        ("pbr + tr", "unknown FTM 'pbr '; did you mean 'pbr'?"),
+        ("pbr,tr", "FTM 'pbr,tr': mechanisms are joined by '+', as 'pbr+tr'"),
         ("pbr+none", "unknown FTM 'none'"),
         ("tr+pbr", "tr+pbr: tr repeats the computation itself, so it can only be innermost (pbr+tr?)"),
         ("assert+lfr", "assert+lfr: lfr replicates, so it can only be outermost (lfr+assert?)"),

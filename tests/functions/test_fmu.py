@@ -516,7 +516,7 @@ def test_what_is_no_archive_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "model.fmu"
     assert refusal(path, tmp_path) == "cannot be read: No such file or directory"
     path.write_bytes(b"no archive")
-    assert refusal(path, tmp_path).startswith("found no zip archive, as an FMU is, or a broken one: ")
+    assert refusal(path, tmp_path) == "found no zip archive, as an FMU is, or a broken one"
     path.unlink()
     os.mkfifo(path)
     assert refusal(path, tmp_path) == "cannot be read: not a regular file"
