@@ -594,7 +594,7 @@ def _words(wanted: _Wanted, runtime: str) -> list[str]:
         words += ["--count", str(sent.count), *(["--rate", rate] if rate else [])]
     words += ["--expect", sent.expect] if sent.expect else []
     for text in wanted.inject:
-        words += ["--inject" if real else "--faults", text]
+        words += ["--inject", text]
     for text in wanted.adapt:
         words += ["--adapt", text]
     words += ["--record", str(wanted.record)] if wanted.record is not None else []

@@ -15,6 +15,7 @@ change is meant, so that a slip is refused, with the verb named that would do it
 Without a word about when, an adaptation begins at once.
 """
 
+import contextlib
 import re
 from collections.abc import Callable
 from typing import Final
@@ -33,6 +34,13 @@ from aftbed.ftm.compose import canonical, parse, replicates
 from aftbed.ftm.registry import KINDS
 
 VERBS: Final = ("to", "switch", "compose", "decompose", "update")
+SYNONYMS: Final = {  # of verbs
+    **dict.fromkeys(("add", "insert", "with"), "compose"),
+    **dict.fromkeys(("remove", "drop", "without"), "decompose"),
+    **dict.fromkeys(("change", "replace", "swap"), "switch"),
+    **dict.fromkeys(("upgrade", "patch", "reload"), "update"),
+    **dict.fromkeys(("adapt", "goto", "go"), "to"),
+}
 GRAMMAR: Final = (
     "to|switch|compose EXPR, decompose, or update BRICK to SOURCE, then [at request N | after 500ms]"
 )
@@ -67,7 +75,7 @@ def read(text: str) -> Timed:
         raise ConfigError(f"adaptation {text!r}: expected {GRAMMAR}")
     verb, *rest = words
     if verb not in VERBS:
-        raise unknown("adaptation", verb, VERBS)
+        raise _no_verb(verb)
     length = {"decompose": 0, "update": 3}.get(verb, 1)
     if len(rest) < length or (verb == "update" and rest[1] != "to"):
         raise ConfigError(f"adaptation {text!r}: expected {GRAMMAR}")
@@ -87,9 +95,14 @@ def read(text: str) -> Timed:
             return Timed(wish, after_ms=milliseconds("after", duration))
         case words:
             found = " ".join(words)
-            raise ConfigError(
-                f"adaptation {text!r}: found {found!r}, allowed is 'at request N' or 'after 500ms'"
-            )
+            meant = f"; did you mean 'after {words[1]}'?" if words[0] == "at" and len(words) == 2 else ""
+            raise ConfigError(f"found {found!r}, allowed is 'at request N' or 'after 500ms'{meant}")
+
+
+def _no_verb(word: str) -> ConfigError:
+    with contextlib.suppress(ConfigError):
+        return ConfigError(f"{word!r} says not how: did you mean 'to {canonical(word)}'? ({GRAMMAR})")
+    return unknown("adaptation", word, VERBS, SYNONYMS)
 
 
 def goal(wish: Wish, running: str, recipe: str = RECIPES[0]) -> Goal:

@@ -43,7 +43,7 @@ from typing import Annotated, Final, Literal
 import msgspec
 from msgspec import Meta
 
-from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.errors import ConfigError, FileKeyError, unknown
 from aftbed.core.events import Event
 from aftbed.ftm.compose import DUPLEX, SIMPLEX, known_expressions, parse, replicates
 from aftbed.ftm.registry import MECHANISMS, find
@@ -191,40 +191,40 @@ class Policy(msgspec.Struct, frozen=True):
     dwell_ns: int
 
 
-def policy_from(file: PolicyFile, where: str) -> Policy:
-    """The policy in `file`; `where` names the file. Raises ConfigError; a contradiction names both rules."""
+def policy_from(file: PolicyFile) -> Policy:
+    """The policy in `file`. Raises FileKeyError; a contradiction names both rules."""
     if not 1 <= len(file.rules) <= RULES_MAX:
-        raise ConfigError(f"{where}: rules: found {len(file.rules)}, allowed are 1 to {RULES_MAX}")
+        raise FileKeyError("rules", f"found {len(file.rules)}, allowed are 1 to {RULES_MAX}")
     dwell_ns, rules = _ns(file.dwell_s), list[Rule]()
     for index, one in enumerate(file.rules):
         key = f"rules[{index}]"
-        when = _condition(one.when, f"{where}: {key}.when", dwell_ns)
-        rules.append(Rule(key, when, action(one.then, f"{where}: {key}.then")))
+        when = _condition(one.when, f"{key}.when", dwell_ns)
+        rules.append(Rule(key, when, action(one.then, f"{key}.then")))
     for first, second in combinations(rules, 2):
         if reason := contradiction(first, second):
-            raise ConfigError(f"{where}: {first} and {second}: {reason}")
+            raise FileKeyError(second.key, f"{first} and {second}: {reason}")
     return Policy(tuple(rules), dwell_ns)
 
 
 def action(text: str, where: str) -> Action:
-    """The action that `text` means. Raises ConfigError."""
+    """The action that `text` means. Raises FileKeyError."""
     verb, _, name = text.strip().partition(" ")
     found = Action(verb, name.strip())
     if verb not in VERBS:
-        raise ConfigError(f"{where}: {unknown('action', verb, VERBS)}")
+        raise FileKeyError(where, unknown("action", verb, VERBS))
     if verb == "to":
         try:
             if not parse(found.name):
                 raise ConfigError("`none` has no engine: nothing leads to it")
         except ConfigError as error:
-            raise ConfigError(f"{where}: {error}") from error
+            raise FileKeyError(where, error) from error
     elif verb == "decompose":
         if name:
-            raise ConfigError(f"{where}: found {text!r}, allowed is `decompose`: all that is inside goes")
+            raise FileKeyError(where, f"found {text!r}, allowed is `decompose`: all that is inside goes")
     else:
         allowed = DUPLEX if verb == "switch" else SIMPLEX
         if find(found.name) is None or replicates(found.name) != (verb == "switch"):
-            raise ConfigError(f"{where}: {unknown(f'FTM to {verb}', found.name, allowed)}")
+            raise FileKeyError(where, unknown(f"FTM to {verb}", found.name, allowed))
     return found
 
 
@@ -273,7 +273,7 @@ def _condition(when: When, where: str, dwell_ns: int) -> Condition:
         _refuse(when, where, "quiet_s", ("count", "within_s"))
         return Quiet(when.event, _ns(when.quiet_s))
     if when.count is None or when.within_s is None:
-        raise ConfigError(f"{where}: an event needs count and within_s, or quiet_s")
+        raise FileKeyError(where, "an event needs count and within_s, or quiet_s")
     within_ns = _ns(when.within_s)
     return Burst(when.event, when.count, within_ns, within_ns + dwell_ns)
 
@@ -288,7 +288,7 @@ def _beyond(when: When, resource: Resource, where: str) -> Beyond:
     condition = Beyond(resource, above, threshold, until, _ns(when.for_s or 0.0))
     if condition.begins(until):
         side = "at most" if above else "at least"
-        raise ConfigError(f"{where}.until: found {until:g}, allowed is {side} {threshold:g}")
+        raise FileKeyError(f"{where}.until", f"found {until:g}, allowed is {side} {threshold:g}")
     return condition
 
 
@@ -296,13 +296,13 @@ def _only_one(when: When, where: str, one: str, other: str) -> None:
     given = [key for key in (one, other) if getattr(when, key) is not None]
     if len(given) != 1:
         found = "both" if given else "none of them"
-        raise ConfigError(f"{where}: found {found}, allowed is one of {one}, {other}")
+        raise FileKeyError(where, f"found {found}, allowed is one of {one}, {other}")
 
 
 def _refuse(when: When, where: str, given: str, keys: tuple[str, ...]) -> None:
     for key in keys:
         if getattr(when, key) is not None:
-            raise ConfigError(f"{where}: {key} does not go with {given}")
+            raise FileKeyError(where, f"{key} does not go with {given}")
 
 
 def _beyond_contradiction(first: Beyond, second: Beyond) -> str:

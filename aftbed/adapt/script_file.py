@@ -28,7 +28,7 @@ from typing import Annotated, Final, Literal, cast, get_args
 import msgspec
 from msgspec import Meta
 
-from aftbed.core.errors import ConfigError, ScriptError, unknown
+from aftbed.core.errors import ConfigError, FileKeyError, ScriptError, unknown
 from aftbed.core.graph import BrickSpec, Link
 from aftbed.core.script import (
     RECIPES,
@@ -163,18 +163,21 @@ def _brick(spec: BrickSpec) -> str | dict[str, str]:
 # -- from a file to a script ----------------------------------------------------------------------
 
 
-def script_from(file: ScriptFile, where: str) -> Script:
-    """The script in `file`; `where` names the file. Raises ScriptError with all that is wrong in it."""
-    problems: list[str] = []
+def script_from(file: ScriptFile, where: str, position: Callable[[str], str] = lambda key: "") -> Script:
+    """The script in `file`; `where` names the file. Raises ScriptError with all that is wrong in it.
+
+    `position` says where a key stands in the file.
+    """
+    problems: list[FileKeyError] = []
     if file.ftm:
         try:
             parse(file.ftm)
         except ConfigError as error:
-            problems.append(f"ftm: {error}")
+            problems.append(FileKeyError("ftm", error))
     prepare = _steps(file.prepare, "prepare", problems)
     commit = _steps(file.commit, "commit", problems)
     finish = _steps(file.finish, "finish", problems)
-    refuse(where, problems)
+    refuse(where, [f"{position(one.key)}{one}" for one in problems])
     return Script(file.purpose, "", prepare, commit, finish, file.ftm, file.recipe)
 
 
@@ -186,31 +189,31 @@ def refuse(where: str, problems: list[str]) -> None:
         raise ScriptError("\n  ".join((f"{where}: {len(problems)} problems:", *problems)))
 
 
-def _steps(entries: Iterable[object], where: str, problems: list[str]) -> tuple[Step, ...]:
+def _steps(entries: Iterable[object], where: str, problems: list[FileKeyError]) -> tuple[Step, ...]:
     """Adds what is wrong to `problems`."""
     found = []
     for index, one in enumerate(entries):
         try:
             found.append(_step(one, f"{where}[{index}]", problems))
-        except ConfigError as error:
-            problems.append(str(error))
+        except FileKeyError as error:
+            problems.append(error)
     return tuple(found)
 
 
-def _step(found: object, where: str, problems: list[str]) -> Step:
+def _step(found: object, where: str, problems: list[FileKeyError]) -> Step:
     if not isinstance(found, dict) or len(found) != 1:
-        raise ConfigError(f"{where}: found {found!r}, allowed is one verb with what it acts on")
+        raise FileKeyError(where, f"found {found!r}, allowed is one verb with what it acts on")
     ((verb, value),) = found.items()
     if verb in RECOVERY:
-        raise ConfigError(f"{where}: {verb} is Recovery's; an adaptation has {', '.join(VERBS)}")
+        raise FileKeyError(where, f"{verb} is Recovery's; an adaptation has {', '.join(VERBS)}")
     if verb not in VERBS:
-        raise ConfigError(f"{where}: {unknown('verb', str(verb), VERBS)}")
+        raise FileKeyError(where, unknown("verb", str(verb), VERBS))
     kind, where = VERBS[verb], f"{where}.{verb}"
     if kind is Stage:
         return _stage(value, where)
     if kind is Together:
         if not isinstance(value, list) or not value:
-            raise ConfigError(f"{where}: found {value!r}, allowed is a list of steps")
+            raise FileKeyError(where, f"found {value!r}, allowed is a list of steps")
         return Together(_steps(value, where, problems))
     if kind is Bind:
         ends = _pair(value, where, "BRICK.PORT")
@@ -228,9 +231,9 @@ def _stage(value: object, where: str) -> Stage:
     node, bricks, held = given["node"], given["bricks"], given.get("held", False)
     node = _text(node, f"{where}.node", "the name of a node")
     if not isinstance(held, bool):
-        raise ConfigError(f"{where}.held: found {held!r}, allowed is true or false")
+        raise FileKeyError(f"{where}.held", f"found {held!r}, allowed is true or false")
     if not isinstance(bricks, dict) or not bricks:
-        raise ConfigError(f"{where}.bricks: found {bricks!r}, allowed is BRICK: KIND, once or more")
+        raise FileKeyError(f"{where}.bricks", f"found {bricks!r}, allowed is BRICK: KIND, once or more")
     specs = [_brick_spec(str(name), one, f"{where}.bricks.{name}") for name, one in bricks.items()]
     return Stage(node, tuple(specs), held)
 
@@ -242,7 +245,7 @@ def _brick_spec(name: str, value: object, where: str) -> BrickSpec:
     else:
         texts = {"kind": _text(value, where, "a kind of brick")}
     if texts["kind"] not in KINDS:
-        raise ConfigError(f"{where}: {unknown('kind of brick', texts['kind'], KINDS)}")
+        raise FileKeyError(where, unknown("kind of brick", texts["kind"], KINDS))
     return BrickSpec(name, **texts)
 
 
@@ -253,19 +256,19 @@ def port_names() -> tuple[str, ...]:
 
 def _keys(value: object, where: str, allowed: tuple[str, ...], needed: tuple[str, ...]) -> StepEntry:
     if not isinstance(value, dict):
-        raise ConfigError(f"{where}: found {value!r}, allowed are the keys {', '.join(allowed)}")
+        raise FileKeyError(where, f"found {value!r}, allowed are the keys {', '.join(allowed)}")
     for key in value:
         if key not in allowed:
-            raise ConfigError(f"{where}: {unknown('key', str(key), allowed)}")
+            raise FileKeyError(where, unknown("key", str(key), allowed))
     for key in needed:
         if key not in value:
-            raise ConfigError(f"{where}: key {key!r} is missing")
+            raise FileKeyError(where, f"key {key!r} is missing")
     return value
 
 
 def _text(value: object, where: str, allowed: str) -> str:
     if not isinstance(value, str) or not value or value != value.strip():
-        raise ConfigError(f"{where}: found {value!r}, allowed is {allowed}")
+        raise FileKeyError(where, f"found {value!r}, allowed is {allowed}")
     return value
 
 
@@ -273,7 +276,7 @@ def _pair(value: object, where: str, of: str) -> tuple[str, str]:
     both = f"{of} {ARROW} {of}"
     source, arrow, sink = _text(value, where, both).partition(f" {ARROW} ")
     if not arrow or not source.strip() or not sink.strip() or ARROW in sink:
-        raise ConfigError(f"{where}: found {value!r}, allowed is {both}")
+        raise FileKeyError(where, f"found {value!r}, allowed is {both}")
     return source.strip(), sink.strip()
 
 
@@ -285,5 +288,5 @@ def _end(text: str, where: str) -> tuple[str, str]:
         if brick and port in port_names():
             return brick, port
     if len(parts) == 1:
-        raise ConfigError(f"{where}: found {text!r}, allowed is BRICK.PORT")
-    raise ConfigError(f"{where}: {unknown('port', parts[-1], port_names())}")
+        raise FileKeyError(where, f"found {text!r}, allowed is BRICK.PORT")
+    raise FileKeyError(where, unknown("port", parts[-1], port_names()))

@@ -30,7 +30,7 @@ import msgspec
 from msgspec import Meta
 
 from aftbed.core.application import NONE, AccessKind, Characteristics
-from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.errors import FileKeyError, unknown
 from aftbed.ftm.compose import expressions, parse, replicates
 from aftbed.ftm.declaration import FaultClass, Level, Mechanism, Suitability
 from aftbed.ftm.registry import MECHANISMS, SHIPPED, find, names
@@ -137,15 +137,14 @@ ROWS: Final = tuple(_declared(MECHANISMS[name]) for name in SHIPPED)
 TABLE: Final = SuitabilityTable({row.mechanism: row for row in ROWS})
 
 
-def table_from(file: TableFile, where: str) -> SuitabilityTable:
-    """The shipped table with the rows of `file` in it; `where` names the file. Raises ConfigError."""
+def table_from(file: TableFile) -> SuitabilityTable:
+    """The shipped table with the rows of `file` in it. Raises FileKeyError."""
     for index, row in enumerate(file.rows):
         if find(row.mechanism) is None:
-            reason = unknown("FTM", row.mechanism, names())
-            raise ConfigError(f"{where}: rows[{index}].mechanism: {reason}")
+            raise FileKeyError(f"rows[{index}].mechanism", unknown("FTM", row.mechanism, names()))
     for name, times in Counter(row.mechanism for row in file.rows).items():
         if times > 1:
-            raise ConfigError(f"{where}: rows: found {times} for {name}, allowed is one")
+            raise FileKeyError("rows", f"found {times} for {name}, allowed is one")
     return SuitabilityTable(TABLE.rows | {row.mechanism: row for row in file.rows}, file.limits)
 
 

@@ -37,11 +37,11 @@ from aftbed.bench.runs import (
 )
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.graph import PLACEMENTS
-from aftbed.core.input_file import read_input
 from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal
 from aftbed.core.progress import Show, unshown
 from aftbed.core.script import RECIPES
+from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import build, parse
 from aftbed.judge import checks
 from aftbed.judge.isolated import reference_of
@@ -51,7 +51,6 @@ from aftbed.vehicle.aeb.function import default_application
 
 RATE_HZ: Final = 200.0
 RING_COUNT: Final = 500
-RESULT_BYTES_MAX: Final = 1_000_000
 
 Outcomes = list[dict[str, object]]
 
@@ -283,13 +282,10 @@ class _ResultFile(_OneWay, frozen=True, kw_only=True):
 def read_times(path: Path) -> dict[Pair, AdaptationTime]:
     """Of a file with the document of `aftbed bench adapt --json`: there, and back. Raises ConfigError."""
     try:
-        found = msgspec.json.decode(read_input(path, RESULT_BYTES_MAX), type=_ResultFile)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ConfigError(
-            f"{path}: {error}; allowed is a file with the document of `aftbed bench adapt --json`"
-        ) from None
+        found = read_yaml(path, _ResultFile)  # JSON is YAML
+    except ConfigError as error:
+        allowed = "allowed is a file with the document of `aftbed bench adapt --json`"
+        raise ConfigError(f"{error}; {allowed}") from None
     where = f"{path}: from {found.old} to {found.new}"
     for name in (found.old, found.new):
         try:

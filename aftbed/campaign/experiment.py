@@ -92,7 +92,7 @@ class Experiment(msgspec.Struct, frozen=True):
         else:
             words += ["--load", f"{self.requests}@{rate}" if rate else str(self.requests)]
         for text in self.faults:
-            words += ["--faults" if simulated else "--inject", shlex.quote(text)]
+            words += ["--inject", shlex.quote(text)]
         for text in self.adaptations:
             words += ["--adapt", shlex.quote(text)]
         words += ["--recipe", self.recipe] if self.recipe == "paper" else []

@@ -35,7 +35,7 @@ from aftbed.campaign.spec import (
     means,
 )
 from aftbed.core.application import Characteristics
-from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.errors import ConfigError, FileKeyError, at_key, unknown
 from aftbed.ftm.compose import build, expressions, replication_of
 from aftbed.ftm.compose import parse as parse_ftm
 from aftbed.ftm.registry import packages_of
@@ -124,19 +124,22 @@ def plan(spec: Spec, trust: Trust = NOBODY) -> CampaignPlan:
     function declares, a function outside of this package is asked, in a process of its own, if `trust` allows
     it; otherwise nothing of it is executed.
     """
+    numbers = {entry.name: number for number, entry in enumerate(spec.faults)}  # in the file
     spec = resolved(spec, trust)
     _check_sizes(spec)
     _check_left_out(spec)
     strata = tuple(strata_of(spec))
     if not strata:
-        raise ConfigError("mechanisms: no entry of faults and adaptations is left for any of them")
+        raise FileKeyError("mechanisms", "no entry of faults and adaptations is left for any of them")
     content = msgspec.json.encode(spec, order="deterministic") + _content(spec)
     digest = hashlib.sha256(content).hexdigest()[:ID_DIGITS]
     packages = packages_of(name for ftm in spec.mechanisms for name in parse_ftm(ftm))
     made = CampaignPlan(spec, digest, code_version(packages), strata)
     for stratum in strata:
-        _check_faults(made, stratum)
-        _check_adaptations(made, stratum)
+        with at_key(f"faults[{numbers[stratum.fault.name]}].fault"):
+            _check_faults(made, stratum)
+        with at_key("adaptations"):
+            _check_adaptations(made, stratum)
     return made
 
 
@@ -182,7 +185,9 @@ def _check_sizes(spec: Spec) -> None:
         raise ConfigError(f"{strata} strata, allowed are {STRATA_MAX}")
     for entry in spec.faults:
         if (many := points(entry)) > POINTS_MAX:
-            raise ConfigError(f"faults: {entry.name!r}: a matrix of {many} points, allowed are {POINTS_MAX}")
+            raise FileKeyError(
+                "faults", f"{entry.name!r}: a matrix of {many} points, allowed are {POINTS_MAX}"
+            )
 
 
 def _check_left_out(spec: Spec) -> None:
@@ -190,9 +195,9 @@ def _check_left_out(spec: Spec) -> None:
     every = [stratum.name for stratum in strata_of(msgspec.structs.replace(spec, leave_out=()))]
     for number, pattern in enumerate(spec.leave_out):
         if every and not any(fnmatchcase(name, pattern) for name in every):
-            raise ConfigError(f"leave_out[{number}]: {unknown('stratum', pattern, every)}")
+            raise FileKeyError(f"leave_out[{number}]", unknown("stratum", pattern, every))
     if every and not any(strata_of(spec)):
-        raise ConfigError("leave_out: it leaves no stratum in")
+        raise FileKeyError("leave_out", "it leaves no stratum in")
 
 
 def _filled(entry: FaultEntry, number: int, chance: Random) -> tuple[str, ...]:
@@ -223,7 +228,7 @@ def population(entry: FaultEntry) -> int:
 
 def _check_faults(made: CampaignPlan, stratum: Stratum) -> None:
     """Every point of the matrix, before anything runs."""
-    where = f"faults: {stratum.fault.name!r} under {stratum.ftm}"
+    where = f"{stratum.fault.name!r} under {stratum.ftm}"
     system = made.spec.system
     graph = build(stratum.ftm, stratum.placement, application=system.app)
     try:
@@ -245,7 +250,7 @@ def _check_adaptations(made: CampaignPlan, stratum: Stratum) -> None:
     try:
         scheduled(stratum.adaptation.texts, graph, stratum.adaptation.recipe)
     except ConfigError as error:
-        raise ConfigError(f"adaptations: {stratum.adaptation.name!r} under {stratum.ftm}: {error}") from error
+        raise ConfigError(f"{stratum.adaptation.name!r} under {stratum.ftm}: {error}") from error
 
 
 # -- what a spec leaves to the function -----------------------------------------------------------

@@ -39,11 +39,11 @@ from msgspec import Meta
 
 from aftbed.campaign.experiment import RATE_HZ_MAX, REQUESTS_MAX
 from aftbed.campaign.states import OF_A_CAR, RunState
-from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.errors import ConfigError, FileKeyError, at_key, unknown
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.requirements import check_requirements
 from aftbed.core.script import RECIPES
-from aftbed.core.yaml_file import read_yaml
+from aftbed.core.yaml_file import in_file, read_yaml
 from aftbed.ftm.compose import expressions, is_listed
 from aftbed.functions.request_file import located_requests
 from aftbed.functions.source import located
@@ -200,22 +200,27 @@ class Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return ftti_ms_of("ftti", self.ftti, work) if self.ftti else 0.0
 
 
+def spec_path(name: str) -> Path:
+    """Of the shipped campaign of that name, or of a file. Raises ConfigError."""
+    if name.endswith((".yaml", ".yml")):
+        return Path(name)
+    if Path(name).exists():
+        raise ConfigError(f"{name}: a file that ends in .yaml, or the name of a shipped campaign is allowed")
+    if name not in shipped():
+        raise unknown("campaign", name, shipped())
+    return SHIPPED / f"{name}.yaml"
+
+
 def read_spec(name: str) -> Spec:
     """The shipped campaign of that name, or a file. Raises ConfigError naming file, line and key."""
-    path = Path(name)
-    if not name.endswith((".yaml", ".yml")):
-        path = SHIPPED / f"{name}.yaml"
-        if not path.exists():
-            raise unknown("campaign", name, shipped())
+    path = spec_path(name)
     spec = read_yaml(path, Spec)
-    try:
+    with in_file(path):
         spec = msgspec.structs.replace(spec, system=_located(spec.system, path.parent))
         check(spec)
         if spec.system.scenario:  # here, since records are reported where the scenario's file is not
             verifies = dict.fromkeys((*spec.verifies, *load_scenario(spec.system.scenario).verifies))
             spec = msgspec.structs.replace(spec, verifies=tuple(verifies))
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
     return spec
 
 
@@ -232,10 +237,8 @@ def _located(system: System, folder: Path) -> System:
     found = {}
     for key, locate in locators.items():
         if text := getattr(system, key):
-            try:
+            with at_key(f"system.{key}"):
                 found[key] = _beside_or_here(text, folder, locate)
-            except ConfigError as error:
-                raise ConfigError(f"system.{key}: {error}") from error
     return msgspec.structs.replace(system, **found)
 
 
@@ -260,26 +263,29 @@ def shipped() -> list[str]:
 def check(spec: Spec) -> None:
     """Check what the types do not express. Raises ConfigError naming the key."""
     if spec.mechanisms != (SUITABLE,):
-        for name in spec.mechanisms:
+        for number, name in enumerate(spec.mechanisms):
             if name != SUITABLE and not is_listed(name):
-                raise ConfigError(f"mechanisms: {unknown('name', name, (*expressions(), SUITABLE))}")
+                raise FileKeyError(f"mechanisms[{number}]", unknown("name", name, (*expressions(), SUITABLE)))
         if SUITABLE in spec.mechanisms:
-            raise ConfigError(f"mechanisms: {SUITABLE!r} stands alone: they are all that suit the function")
+            raise FileKeyError(
+                "mechanisms", f"{SUITABLE!r} stands alone: they are all that suit the function"
+            )
     _each_known("sometimes", spec.sometimes, tuple(state.value for state in RunState))
     if not spec.system.scenario and (of_a_car := [name for name in OF_A_CAR if name in spec.sometimes]):
-        raise ConfigError(f"sometimes: {of_a_car[0]}: no experiment has a car: add system.scenario")
+        raise FileKeyError("sometimes", f"{of_a_car[0]}: no experiment has a car: add system.scenario")
     check_requirements("verifies", spec.verifies)
     _each_known("system.placements", spec.system.placements, PLACEMENTS)
     if not spec.system.placements:
-        raise ConfigError("system.placements: found none, allowed is at least one of them")
+        raise FileKeyError("system.placements", "found none, allowed is at least one of them")
     if spec.system.scenario:
-        load_scenario(spec.system.scenario)
+        with at_key("system.scenario"):
+            load_scenario(spec.system.scenario)
         if spec.system.request_file:
-            raise ConfigError("system.request_file: the car of system.scenario makes the requests")
+            raise FileKeyError("system.request_file", "the car of system.scenario makes the requests")
     _all_different("faults", [entry.name for entry in spec.faults])
     _all_different("adaptations", [entry.name for entry in spec.adaptations])
     if not spec.adaptations:
-        raise ConfigError("adaptations: found none; leave the key out, or name at least one")
+        raise FileKeyError("adaptations", "found none; leave the key out, or name at least one")
     for number, entry in enumerate(spec.faults):
         _check_fault(f"faults[{number}]", entry, spec)
     for number, adaptation in enumerate(spec.adaptations):
@@ -290,13 +296,16 @@ def check(spec: Spec) -> None:
             any(MECHANISM_PLACE in text for text in adaptation.texts)
             and MECHANISM_PLACE not in adaptation.name
         ):
-            raise ConfigError(f"{where}.name: {MECHANISM_PLACE} stands in adapt, so it has to in the name")
+            raise FileKeyError(
+                f"{where}.name", f"{MECHANISM_PLACE} stands in adapt, so it has to in the name"
+            )
         _each_known(f"{where}.recipe", (adaptation.recipe,), RECIPES)
-    ftti_ms = spec.ftti_ms
+    with at_key("ftti"):
+        ftti_ms = spec.ftti_ms
     for number, gate in enumerate(spec.gates):
         _check_gate(f"gates[{number}]", gate)
         if gate.metric == FHTI_MARGIN and not ftti_ms:
-            raise ConfigError(f"gates[{number}].metric: {FHTI_MARGIN} is of an FTTI: add ftti, as 100ms")
+            raise FileKeyError(f"gates[{number}].metric", f"{FHTI_MARGIN} is of an FTTI: add ftti, as 100ms")
 
 
 def mechanisms_of(spec: Spec) -> tuple[str, ...]:
@@ -313,39 +322,41 @@ def _check_fault(where: str, entry: FaultEntry, spec: Spec) -> None:
     _each_means(f"{where}.mechanisms", entry.mechanisms, mechanisms_of(spec))
     for key, values in entry.matrix.items():
         if not values:
-            raise ConfigError(f"{where}.matrix.{key}: it is empty: name at least one value")
+            raise FileKeyError(f"{where}.matrix.{key}", "it is empty: name at least one value")
     for key, (low, high) in entry.draw.items():
         if low > high:
-            raise ConfigError(f"{where}.draw.{key}: found [{low}, {high}], allowed is [lowest, highest]")
+            raise FileKeyError(f"{where}.draw.{key}", f"found [{low}, {high}], allowed is [lowest, highest]")
     twice = entry.matrix.keys() & entry.draw.keys()
     if twice:
-        raise ConfigError(f"{where}: {min(twice)!r} stands in matrix and in draw")
+        raise FileKeyError(where, f"{min(twice)!r} stands in matrix and in draw")
     for mechanism, outcomes in entry.expect.items():
         if mechanism != ANY:
-            _each_means(f"{where}.expect", (mechanism,), mechanisms_of(spec))
+            known = mechanisms_of(spec)
+            if not any(means((mechanism,), name) for name in known):
+                raise FileKeyError(f"{where}.expect.{mechanism}", unknown("name", mechanism, known))
         _each_known(f"{where}.expect.{mechanism}", outcomes, OUTCOMES)
 
 
 def _check_gate(where: str, gate: Gate) -> None:
     if gate.metric not in METRICS:
-        raise ConfigError(f"{where}.metric: {unknown('metric', gate.metric, METRICS)}")
+        raise FileKeyError(f"{where}.metric", unknown("metric", gate.metric, METRICS))
     if (gate.max is None) == (gate.min is None):
-        raise ConfigError(f"{where}: either max or min is allowed, and needed")
+        raise FileKeyError(where, "either max or min is allowed, and needed")
 
 
 def _each_known(where: str, names: tuple[str, ...], allowed: tuple[str, ...]) -> None:
-    for name in names:
+    for number, name in enumerate(names):
         if name not in allowed:
-            raise ConfigError(f"{where}: {unknown('name', name, allowed)}")
+            raise FileKeyError(f"{where}[{number}]", unknown("name", name, allowed))
 
 
 def _each_means(where: str, patterns: tuple[str, ...], allowed: Iterable[str]) -> None:
-    for pattern in patterns:
+    for number, pattern in enumerate(patterns):
         if not any(means((pattern,), name) for name in allowed):
-            raise ConfigError(f"{where}: {unknown('name', pattern, allowed)}")
+            raise FileKeyError(f"{where}[{number}]", unknown("name", pattern, allowed))
 
 
 def _all_different(where: str, names: list[str]) -> None:
-    for name in names:
-        if names.count(name) > 1:
-            raise ConfigError(f"{where}: {name!r} stands twice")
+    for number, name in enumerate(names):
+        if name in names[:number]:
+            raise FileKeyError(f"{where}[{number}].name", f"{name!r} stands twice")

@@ -6,9 +6,10 @@ plans the change on the graph that runs when it begins, checks it, and carries i
 
 import sys
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, ClassVar, Final
 
 import msgspec
 import typer
@@ -20,7 +21,7 @@ from aftbed.adapt.planner import APPLICATION, Plan, target
 from aftbed.adapt.planner import plan as plan_between
 from aftbed.adapt.script_file import ScriptFile, entry, mapping, phases, script_from
 from aftbed.adapt.suitability import remarks, unsuitable
-from aftbed.cli.options import Json, Recipe, Run, class_source, print_json, takes
+from aftbed.cli.options import Json, Recipe, Run, choices, class_source, print_json, takes
 from aftbed.cli.parsing import PlainGroup
 from aftbed.cli.views import EndedAdaptation, history_lines
 from aftbed.core.application import Characteristics
@@ -28,8 +29,8 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import Script, Stage, Step, Together
-from aftbed.core.yaml_file import read_yaml
-from aftbed.ftm.compose import build, protected_by
+from aftbed.core.yaml_file import position, read_yaml
+from aftbed.ftm.compose import EXPRESSIONS, build, protected_by
 from aftbed.functions.source import located
 from aftbed.runtime.unix import control_client, run_directory
 from aftbed.runtime.unix.trust import versioned
@@ -43,7 +44,14 @@ WHEN: Final = {
     "finish": "when nothing has broken",
 }
 
-adapt = typer.Typer(cls=PlainGroup)
+
+class AdaptGroup(PlainGroup):
+    """Knows the verbs by what others call them; a mechanism alone is what to adapt to."""
+
+    MEANT: ClassVar[Mapping[str, str]] = {**commands.SYNONYMS, **dict.fromkeys(EXPRESSIONS, "to")}
+
+
+adapt = typer.Typer(cls=AdaptGroup)
 
 Expr = Annotated[str, typer.Argument(help="The whole new expression, the outer mechanism first: lfr+tr.")]
 MayFail = Annotated[
@@ -115,7 +123,8 @@ def script(
 ) -> None:
     """Carry out a script from a file; all of it is checked before its first step."""
     path = Path(file)
-    wanted = _absolute(script_from(read_yaml(path, ScriptFile), file), path.parent)
+    found = script_from(read_yaml(path, ScriptFile), file, partial(position, path))
+    wanted = _absolute(found, path.parent)
     goal = Goal(script=wanted, recipe=wanted.recipe, file=file, may_fail=may_fail)
     raise typer.Exit(_ask(run_directory.find(run), goal, as_json=json))
 
@@ -263,7 +272,7 @@ def plan(
         str | None, typer.Option("--from", help="From this mechanism; without it, from what runs.")
     ] = None,
     placement: Annotated[
-        str | None, typer.Option(help="With --from: process (default), replica or single.")
+        str | None, typer.Option(metavar=choices(PLACEMENTS), help="With --from; process if left out.")
     ] = None,
     recipe: Recipe = "drained",
     run: Run = None,

@@ -16,9 +16,10 @@ from aftbed.bench.recovery import bench_recovery
 from aftbed.bench.resources import bench_launch, bench_memory
 from aftbed.bench.rounds import ROUNDS, text
 from aftbed.cli.interrupted import told_if_interrupted
-from aftbed.cli.options import App, Ftm, Json, Recipe, check_range, print_json
+from aftbed.cli.options import App, Ftm, Json, Recipe, check_range, choices, print_json
 from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError
+from aftbed.core.graph import PLACEMENTS
 from aftbed.ftm.compose import DUPLEX, replication_of
 from aftbed.functions.load import OWN_CODE
 from aftbed.functions.request_file import located_requests, requests_from
@@ -30,7 +31,7 @@ REQUESTS_MIN: Final = 5000
 SENT_FUNCTION: Final = 512  # requests of MODULE:FUNCTION, sent in turn
 KILLS_MIN: Final = 1
 
-Placement = Annotated[str, typer.Option(help="process, replica or single.")]
+Placement = Annotated[str, typer.Option(metavar=choices(PLACEMENTS), help="Which bricks share a process.")]
 Rounds = Annotated[
     int, typer.Option(min=1, help=f"Of figure and limit in turn; below {ROUNDS} they are too few to quote.")
 ]
@@ -121,6 +122,21 @@ def launch(
     with _measuring("launch", as_json=json) as progress:
         found = bench_launch(ftm, placement, runs, progress.show)
     _print(found, as_json=json)
+
+
+@bench.command()
+def page(
+    ftm: Ftm = "pbr",
+    placement: Placement = "process",
+    seconds: Annotated[float, typer.Option(min=0.1, help="Of each round, with a page and without.")] = 1.0,
+    pin: Pin = True,
+    rounds: Rounds = ROUNDS,
+    json: Json = False,
+) -> None:
+    """Cycle time at the client while a live page reads the run, alternating with runs without a page."""
+    from aftbed.bench.page import bench_page  # noqa: PLC0415 - see above
+
+    _print(bench_page(ftm, placement, seconds, pin=pin, rounds=rounds), as_json=json)
 
 
 @bench.command()

@@ -22,7 +22,7 @@ from aftbed.campaign import ledger, runner
 from aftbed.campaign.experiment import REQUESTS_MAX, Result, carry_out, refuse_untrusted, smallest
 from aftbed.campaign.plan import CampaignPlan, size_of
 from aftbed.campaign.plan import plan as plan_of
-from aftbed.campaign.spec import EXPERIMENTS_MAX, Spec, check, read_spec, shipped
+from aftbed.campaign.spec import EXPERIMENTS_MAX, Spec, check, read_spec, shipped, spec_path
 from aftbed.cli.interrupted import interrupted
 from aftbed.cli.options import (
     App,
@@ -32,12 +32,14 @@ from aftbed.cli.options import (
     TrustedFolders,
     check_file,
     check_range,
+    choices,
     jobs_of,
     print_json,
     takes,
 )
 from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError, shown, unknown
+from aftbed.core.yaml_file import in_file
 from aftbed.functions.load import OWN_CODE
 from aftbed.functions.request_file import located_requests, requests_from
 from aftbed.functions.source import located
@@ -92,7 +94,9 @@ class CampaignArguments(msgspec.Struct, frozen=True, kw_only=True):
     experiments: Annotated[
         int | None, typer.Option("--experiments", help="In each stratum; overrides that of the file.")
     ] = None
-    runtime: Annotated[str | None, typer.Option(help="unix or sim; overrides that of the file.")] = None
+    runtime: Annotated[
+        str | None, typer.Option(metavar=choices(RUNTIMES), help="Overrides that of the file.")
+    ] = None
     app: App = None
     requests: Requests = None
     count: Annotated[
@@ -100,6 +104,14 @@ class CampaignArguments(msgspec.Struct, frozen=True, kw_only=True):
     ] = None
     ftti: Ftti = None
     json: Json = False
+
+
+def check_ftti(spec: Spec) -> None:
+    """Raise ConfigError if `--ftti` is no FTTI."""
+    try:
+        assert spec.ftti_ms
+    except ConfigError as error:
+        raise ConfigError(f"--{error}") from None
 
 
 def planned(given: CampaignArguments, trust: Trust = NOBODY) -> CampaignPlan:
@@ -129,11 +141,10 @@ def planned(given: CampaignArguments, trust: Trust = NOBODY) -> CampaignPlan:
         spec = replace(spec, system=replace(spec.system, requests=given.count))
     if given.ftti is not None:
         spec = replace(spec, ftti=given.ftti)
-    try:
+        check_ftti(spec)
+    with in_file(spec_path(given.name)):
         check(spec)
         return plan_of(spec, trust)
-    except ConfigError as error:
-        raise ConfigError(f"{given.name}: {error}") from error
 
 
 class PlanArguments(CampaignArguments, frozen=True, kw_only=True):
@@ -194,9 +205,9 @@ class CampaignRunArguments(CampaignArguments, frozen=True, kw_only=True):
     resume: Annotated[bool, typer.Option("--resume", help="Run only what is missing in the directory.")] = (
         False
     )
-    executor: Annotated[str, typer.Option(help="local processes, or dask (needs --scheduler).")] = EXECUTORS[
-        0
-    ]
+    executor: Annotated[
+        str, typer.Option(metavar=choices(EXECUTORS), help="local processes, or dask (needs --scheduler).")
+    ] = EXECUTORS[0]
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler.")] = None
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import msgspec
 import typer
 
-from aftbed.cli.options import Html, Json, Junit, TrustedFolders, check_file
+from aftbed.cli.options import Html, Json, Junit, Quiet, TrustedFolders, check_file
 from aftbed.cli.views import show_verdict
 from aftbed.judge.record import read_record
 from aftbed.judge.verdict import EXIT_CODES, Verdict, evidence_of, judge
@@ -19,24 +19,25 @@ def check(
     trust: TrustedFolders = None,
     junit: Junit = None,
     html: Html = None,
+    quiet: Quiet = False,
     json: Json = False,
 ) -> None:
     """Judge a recorded run again."""
     check_file("--junit", junit)
     check_file("--html", html)
-    verdict = judge_and_show(record, trusting(trust), as_json=json)
+    verdict = judge_and_show(record, trusting(trust), as_json=json, quiet=quiet)
     lines = write_junit(junit, verdict) if junit is not None else []
     lines += write_html(html, record, verdict) if html is not None else []
-    if lines and not json:
+    if lines and not (json or quiet):
         print("\n".join(lines))
     raise typer.Exit(EXIT_CODES[verdict.verdict])
 
 
-def judge_and_show(record: Path, trust: Trust, *, as_json: bool) -> Verdict:
+def judge_and_show(record: Path, trust: Trust, *, as_json: bool, quiet: bool = False) -> Verdict:
     """Judge the record in this directory, and print the verdict."""
     found = read_record(record)
     verdict = judge(found, evidence_of(found, trust=trust))
-    show_verdict(verdict, as_json=as_json)
+    show_verdict(verdict, as_json=as_json, quiet=quiet)
     return verdict
 
 

@@ -12,7 +12,17 @@ from msgspec.structs import replace
 
 from aftbed.cli.adapt import refuse_unsuitable
 from aftbed.cli.interrupted import interrupted
-from aftbed.cli.options import App, Json, check_range, jobs_of, note_unusable, print_json, separated, takes
+from aftbed.cli.options import (
+    App,
+    Json,
+    check_range,
+    choices,
+    jobs_of,
+    note_unusable,
+    print_json,
+    separated,
+    takes,
+)
 from aftbed.cli.parsing import PlainGroup
 from aftbed.cli.request_options import RequestSource, first_requests
 from aftbed.cli.sim import described, event_lines, picture, shown_apart
@@ -55,7 +65,7 @@ class ExploreArguments(msgspec.Struct, frozen=True, kw_only=True):
         typer.Option(help="Mechanisms, separated by commas or given one by one; all if left out."),
     ] = ()
     placement: Annotated[
-        tuple[str, ...], typer.Option(help="process or replica, likewise; both if left out.")
+        tuple[str, ...], typer.Option(metavar=choices(PLACEMENTS), help="Likewise; both if left out.")
     ] = ()
     jobs: Annotated[int | None, typer.Option(help="Processes; one per CPU if left out.")] = None
     json: Json = False

@@ -30,7 +30,7 @@ from aftbed.cli.options import Json, check_range, note_unusable, print_blocks, p
 from aftbed.core.application import NONE
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
-from aftbed.core.yaml_file import read_yaml
+from aftbed.core.yaml_file import in_file, read_yaml
 from aftbed.ftm.compose import build, expressions
 from aftbed.functions.source import located
 from aftbed.judge.isolated import declared_by
@@ -43,7 +43,7 @@ SUBCOMMANDS: Final[CommandTable] = {
         "Which changes of FT, A and R a set of mechanisms answers: by staying, by an adaptation, by nothing.",
     ),
 }
-ftm = typer.Typer(cls=group_of(SUBCOMMANDS))
+ftm = typer.Typer(cls=group_of(SUBCOMMANDS, "ftm"))
 EXIT_INCONSISTENT: Final = 1
 CPUS_MAX: Final = 1024
 BANDWIDTH_KBIT_S_MAX: Final = 1e9
@@ -58,7 +58,11 @@ TableOption = Annotated[
 
 def table_of(path: str | None) -> SuitabilityTable:
     """What `--table` means. Raises ConfigError."""
-    return TABLE if path is None else table_from(read_yaml(Path(path), TableFile), path)
+    if path is None:
+        return TABLE
+    file = read_yaml(Path(path), TableFile)
+    with in_file(Path(path)):
+        return table_from(file)
 
 
 @ftm.command("list")

@@ -16,7 +16,7 @@ from typing import Annotated, Final, NamedTuple
 import typer
 
 from aftbed import functions
-from aftbed.cli.options import Json, print_json
+from aftbed.cli.options import Json, choices, print_json
 from aftbed.cli.parsing import PlainGroup
 from aftbed.cli.schema import schema_text
 from aftbed.core.errors import ConfigError, unknown
@@ -226,7 +226,7 @@ KINDS: Final = {
 @init.command("function")
 def new(
     name: Annotated[str, typer.Argument(help="Of the project, and of its new directory.")],
-    kind: Annotated[str, typer.Option(help=f"What the function is: {', '.join(KINDS)}.")] = "class",
+    kind: Annotated[str, typer.Option(metavar=choices(KINDS), help="What the function is.")] = "class",
     to: ToFolder = None,
     json: Json = False,
 ) -> None:

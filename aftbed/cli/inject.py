@@ -2,20 +2,20 @@
 
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, ClassVar, Final
 
 import msgspec
 import typer
 from msgspec.structs import asdict, replace
 
-from aftbed.cli.options import Json, Run, print_json, takes
+from aftbed.cli.options import Json, Run, choices, print_json, takes
 from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.inject.bus import read_bus_fault
 from aftbed.inject.memory import refuse_unsafe
-from aftbed.inject.model import Fault, on_bus, parse, read
+from aftbed.inject.model import SYNONYMS, Fault, on_bus, parse, read
 from aftbed.inject.radar import EFFECTS, RADAR
 from aftbed.inject.value import MEMORY
 from aftbed.runtime.unix import control_client, run_directory
@@ -25,6 +25,7 @@ from aftbed.runtime.unix.options import Work, with_names_resolved
 class InjectGroup(PlainGroup):
     """Takes the words of a fault as one argument too, as `run --inject` does."""
 
+    MEANT: ClassVar[Mapping[str, str]] = SYNONYMS
     WHOLE = "fault"  # the command that takes them
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -61,7 +62,7 @@ At = Annotated[str | None, typer.Option(help="Event to strike at, as checkpoint.
 Nth = Annotated[str | None, typer.Option(help="Which occurrence of the event, counted from now.")]
 After = Annotated[str | None, typer.Option(help="How long from now, as 200ms.")]
 When = Annotated[str | None, typer.Option(help='At a state of the car, as "ttc < 1.2": ttc, gap or speed.')]
-Replica = Annotated[str | None, typer.Option(help="primary (default), backup, a or b.")]
+Replica = Annotated[str | None, typer.Option(metavar="<primary|backup|a|b>", help="primary if left out.")]
 Permanent = Annotated[bool, typer.Option("--permanent", help="Each time from the first strike on.")]
 Every = Annotated[str | None, typer.Option(help="Each Nth time from the first strike on.")]
 Chance = Annotated[str | None, typer.Option(help="Each time with this chance, as 0.1; seeded.")]
@@ -140,7 +141,9 @@ class BitflipArguments(msgspec.Struct, frozen=True, kw_only=True):
     byte: Annotated[str | None, typer.Option(help="All of this byte, or of a `drawn` one.")] = None
     burst: Annotated[str | None, typer.Option(help="So many bits side by side, from --bit on.")] = None
     stuck: Annotated[str | None, typer.Option(help="A bit and its value, as 60=1.")] = None
-    level: Annotated[str, typer.Option(help="value, or memory: any byte of a process.")] = "value"
+    level: Annotated[
+        str, typer.Option(metavar=choices(LEVELS), help="value, or memory: any byte of a process.")
+    ] = "value"
     address: Annotated[
         str | None,
         typer.Option(help="With --level memory: address of the byte, as 0x7f00; drawn if left out."),

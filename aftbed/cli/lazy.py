@@ -8,6 +8,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from aftbed.cli import examples
 from aftbed.cli.parsing import PlainCommand, PlainGroup
 
 CommandTable = Mapping[
@@ -18,9 +19,10 @@ CommandTable = Mapping[
 class LazyCommand(TyperCommand):
     """A name and a help text. The attribute is a function, or a typer.Typer that holds subcommands."""
 
-    def __init__(self, name: str, place: str, about: str) -> None:
+    def __init__(self, name: str, place: str, about: str, group: str = "") -> None:
         super().__init__(name, help=about, rich_markup_mode=None)
         self._place = place
+        self._words = f"{group} {name}".lstrip()
 
     def make_context(self, *arguments: Any, **settings: Any) -> Any:
         """The context of the command that is loaded, so that typer goes on with that one."""
@@ -43,16 +45,19 @@ class LazyCommand(TyperCommand):
         assert self.name is not None
         loaded = typer.main.get_group(parent).commands[self.name]
         assert isinstance(loaded, TyperCommand | TyperGroup)
+        loaded.epilog = examples.epilog(self._words)
+        for name, command in getattr(loaded, "commands", {}).items():
+            command.epilog = examples.epilog(f"{self._words} {name}")
         return loaded
 
 
-def group_of(table: CommandTable) -> type[TyperGroup]:
-    """A group that has, after the commands that it defines, those of `table`."""
+def group_of(table: CommandTable, group: str = "") -> type[TyperGroup]:
+    """A group of that name that has, after the commands that it defines, those of `table`."""
 
     class LazyGroup(PlainGroup):
         def __init__(self, **settings: Any) -> None:
             super().__init__(**settings)
             for name, (place, about) in table.items():
-                self.add_command(LazyCommand(name, place, about))
+                self.add_command(LazyCommand(name, place, about, group))
 
     return LazyGroup

@@ -1,16 +1,24 @@
 """Commands for a live run, from a second terminal: `aftbed status`, `ps`, `graph`, `stop`."""
 
+import os
+from pathlib import Path
 from typing import Annotated, Final
 
 import msgspec
 import typer
 
-from aftbed.cli.options import Json, Run, print_json
-from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.graph import Graph
+from aftbed.cli.options import Json, Run, choices, print_blocks, print_json
+from aftbed.cli.views import car_line, event_line, requests_line, sight_line
+from aftbed.core.errors import ConfigError, shown, unknown
+from aftbed.core.graph import PLACEMENTS, Graph
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix import control_client, run_directory
 from aftbed.runtime.unix.control_client import measured
+from aftbed.runtime.unix.run_directory import EVENT_LOG_NAME
+from aftbed.vehicle.can.bus_model import CHANNEL, HOST
+
+EVENTS_SHOWN: Final = 8
+EVENTS_BYTES: Final = 8192  # of the end of the log, in which they are
 
 
 def status(run: Run = None, json: Json = False) -> None:
@@ -18,9 +26,42 @@ def status(run: Run = None, json: Json = False) -> None:
     found = control_client.ask(run_directory.find(run), control_client.StatusQuery())
     if json:
         print_json(found)
-        return
-    for key, value in found.items():
-        print(f"{key:10} {value}")
+    else:
+        print_blocks(**_blocks(msgspec.convert(found, control_client.Status)))
+
+
+def _blocks(status: control_client.Status) -> dict[str, list[str]]:
+    """The status in lines, by the word before them."""
+    adapting = ", adapting" if status.adapting else ""
+    counted = f"{status.adaptations} adaptation{'s' if status.adaptations != 1 else ''}"
+    blocks = {
+        "run": [f"{status.run}, for {status.seconds:.1f} s"],
+        "mechanism": [f"{status.ftm} ({status.placement}){adapting}, {counted}"],
+        "roles": [status.roles],
+    }
+    if status.requests is not None:
+        blocks["requests"] = [requests_line(status)]
+    if status.vehicle is not None:
+        blocks["car"] = [car_line(status.vehicle).strip()]
+    if status.sees is not None:
+        blocks["sees"] = [sight_line(status.sees).strip()]
+    if status.port:
+        blocks["bus"] = [f"{CHANNEL} at {HOST}:{status.port}, for clients of socketcand"]
+    if status.busy:
+        blocks["busy"] = [", ".join(status.busy)]
+    return blocks | {"record": [status.record], "events": _last_events(Path(status.record))}
+
+
+def _last_events(record: Path) -> list[str]:
+    """The last lines of the event log, as `aftbed run` prints them."""
+    try:
+        with (record / EVENT_LOG_NAME).open("rb") as file:
+            begin = file.seek(max(0, os.fstat(file.fileno()).st_size - EVENTS_BYTES))
+            *lines, _ = file.read().split(b"\n")
+    except OSError:  # it has ended meanwhile
+        return []
+    whole = lines[1:] if begin else lines
+    return [shown(event_line(msgspec.json.decode(line))) for line in whole[-EVENTS_SHOWN:]]
 
 
 def ps(run: Run = None, json: Json = False) -> None:
@@ -52,8 +93,15 @@ def stop(run: Run = None, json: Json = False) -> None:
 
 def graph(
     ftm: Annotated[str | None, typer.Option(help="Show this FTM's graph; without it, a live run's.")] = None,
-    placement: Annotated[str, typer.Option(help="With --ftm: process or replica.")] = "process",
-    style: Annotated[str, typer.Option("--format", help="text, dot or mermaid.")] = "text",
+    placement: Annotated[
+        str, typer.Option(metavar=choices(PLACEMENTS), help="With --ftm: which bricks share a process.")
+    ] = "process",
+    style: Annotated[
+        str,
+        typer.Option(
+            "--format", metavar="<text|dot|mermaid>", help="Of Graphviz, or for a page in Markdown."
+        ),
+    ] = "text",
     run: Run = None,
     json: Json = False,
 ) -> None:

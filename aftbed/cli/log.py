@@ -20,12 +20,18 @@ def convert(
     from_format: Annotated[
         str | None,
         typer.Option(
-            "--from", help="candump, asc, blf, trc, mf4 or csv (by frame), if SOURCE's ending does not say."
+            "--from",
+            metavar="<candump|asc|blf|trc|mf4|csv>",
+            help="If SOURCE's ending does not say; csv by frame.",
         ),
     ] = None,
     to_format: Annotated[
         str | None,
-        typer.Option("--to", help="One of these, csv by signal, if SINK's ending does not say."),
+        typer.Option(
+            "--to",
+            metavar="<candump|asc|blf|trc|mf4|csv>",
+            help="If SINK's ending does not say; csv by signal.",
+        ),
     ] = None,
     dbc: Annotated[
         Path | None, typer.Option(help="The DBC of the frames, to write csv; aftbed's own if left out.")

@@ -68,7 +68,10 @@ SEE_ALSO: Final = ("python(1), candump(1), systemd-run(1)", "The pages in docs/ 
 
 
 def man() -> None:
-    """The manual page. On a terminal man(1) shows it; else it is printed, as roff."""
+    """The manual page: commands, options, exit codes, files.
+
+    On a terminal man(1) shows it; else it is printed, as roff.
+    """
     page = manual_page()
     shown = sys.stdout.isatty() and shutil.which("man") is not None
     if shown and subprocess.run(["man", "-l", "-"], input=page.encode(), check=False).returncode == 0:

@@ -80,10 +80,11 @@ def check(
 
     Exit code: 0 it fits, 1 it makes nothing of the log, 2 it does not fit the DBC.
     """
+    map_path = find_map(name)
     if dbc is None and name not in shipped_dbcs():
         raise ConfigError(f"map check {name}: its DBC is not shipped; --dbc FILE is needed")
     path = find_dbc(dbc or name)
-    bound = bind(find_map(name), path)
+    bound = bind(map_path, path)
     decoded = None if log is None else try_out(bound, _frames(log))
     found = [] if decoded is None else decoded.problems()
     problems = [*bound.problems, *found]

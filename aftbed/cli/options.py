@@ -5,15 +5,17 @@ import inspect
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Annotated, Final, Generic, TypeVar, get_args, get_origin
+from types import GenericAlias
+from typing import Annotated, Any, Final, Generic, TypeVar, get_args, get_origin
 
 import msgspec
 import typer
 
 from aftbed.core.errors import ConfigError, shown
 from aftbed.core.requirements import check_requirements
+from aftbed.core.script import RECIPES
 
 SEED_MAX: Final = 2**63 - 1
 RATE_HZ_MAX: Final = 100_000.0
@@ -44,13 +46,26 @@ Junit = Annotated[Path | None, typer.Option(help="Write the verdict to this file
 VERIFIES: Final = "--verifies"
 VERIFIES_HELP: Final = "A requirement, as SG-1, that the run verifies; may be given several times."
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
+Quiet = Annotated[
+    bool, typer.Option("--quiet", "-q", help="Print the verdict and its reasons, and nothing else.")
+]
 Ftm = Annotated[str, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...: aftbed ftm list.")]
 Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
 TrustedFolders = Annotated[
     list[Path] | None,
     typer.Option("--trust", help="Directory whose functions may be executed; may be given several times."),
 ]
-Recipe = Annotated[str, typer.Option(help="drained, or paper: SIGSTOP, kill, launch, link, SIGCONT.")]
+
+
+def choices(names: Iterable[str]) -> str:
+    """As the help shows what an option allows."""
+    return f"<{'|'.join(names)}>"
+
+
+Recipe = Annotated[
+    str,
+    typer.Option(metavar=choices(RECIPES), help="drained, or paper: SIGSTOP, kill, launch, link, SIGCONT."),
+]
 
 Arguments = TypeVar("Arguments", bound=msgspec.Struct)
 
@@ -89,7 +104,10 @@ def _parameter(field: msgspec.structs.FieldInfo) -> inspect.Parameter:
     annotation, default = field.type, field.default
     kind, *about = get_args(annotation) if get_origin(annotation) is Annotated else (annotation,)
     if get_origin(kind) is tuple:
-        annotation, default = Annotated[(list[get_args(kind)[0]] | None, *about)], None  # type: ignore[misc]
+        several: Any = GenericAlias(list, get_args(kind)[:1])
+        if default is not msgspec.NODEFAULT:
+            several, default = several | None, None
+        annotation = Annotated[(several, *about)]
     if default is msgspec.NODEFAULT:
         default = inspect.Parameter.empty
     return inspect.Parameter(

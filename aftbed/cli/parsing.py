@@ -4,20 +4,24 @@ typer (0.29) builds a pydantic adapter for each option, even for one that was no
 adapters take 80 ms of CPU time, half of what it takes to import all libraries of a run. Most options are
 words, numbers, paths and flags; those are converted here, to the same values. A command line with anything
 else in it (a value that is wrong, an option that only typer knows to check, help) is left to typer as a
-whole, with its messages.
+whole. What typer refuses is said in our words: `usage`.
 """
 
 import inspect
 import os
 import re
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Final, Union, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Final, Union, get_args, get_origin
 
+import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.models import ParameterInfo
 
+# The class of all that typer refuses, in its own copy of click or in click itself, by its version.
+_UsageError: Final[type[Exception]] = sys.modules[typer.BadParameter.__module__].UsageError
 _INT: Final = re.compile(r"[-+]?[0-9]{1,18}", re.ASCII)
 _FLOAT: Final = re.compile(r"[-+]?[0-9]{1,18}(\.[0-9]{1,18})?([eE][-+]?[0-9]{1,2})?", re.ASCII)
 
@@ -30,26 +34,41 @@ class PlainCommand(TyperCommand):
     """A command that typer has made of a function."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Take in the words of the command line; none is left. Raises typer's errors."""
+        """Take in the words of the command line; none is left. Raises ConfigError."""
+        words = tuple(args)
         try:
             ctx.params.update(self._plain_values(ctx, list(args)))
         except _LeftToTyperError:
-            return super().parse_args(ctx, args)
+            try:
+                return super().parse_args(ctx, args)
+            except _UsageError as error:
+                raise self._explained(error, ctx, words) from error
+        except _UsageError as error:
+            raise self._explained(error, ctx, words) from error
         ctx.args = []
         return []
+
+    def _explained(self, error: Exception, ctx: Any, words: Sequence[str]) -> Exception:
+        from aftbed.cli import usage  # noqa: PLC0415 - only of a mistake
+
+        declared = inspect.signature(self.callback).parameters if self.callback is not None else {}
+        kinds = {name: _in_words(one.annotation) for name, one in declared.items()}
+        return usage.explained(error, ctx, words, kinds)
 
     def _plain_values(self, ctx: Any, args: list[str]) -> dict[str, object]:
         """By the name of the parameter. Raises _LeftToTyperError; of words that are no options, typer's."""
         if ctx.resilient_parsing or self.callback is None or (self.no_args_is_help and not args):
             raise _LeftToTyperError
         given, left, _ = self.make_parser(ctx).parse_args(args=args)
+        if left:
+            raise _LeftToTyperError
         declared = inspect.signature(self.callback).parameters
         found: dict[str, object] = {}
         for one in self.get_params(ctx):
             word = given.get(one.name)
             if one.is_eager and not word:  # help
                 continue
-            if left or one.is_eager or one.callback is not None or one.name not in declared:
+            if one.is_eager or one.callback is not None or one.name not in declared:
                 raise _LeftToTyperError
             if word is None and one.required:
                 raise _LeftToTyperError
@@ -61,14 +80,43 @@ class PlainCommand(TyperCommand):
 class PlainGroup(TyperGroup):
     """A group of commands. The word for one of them comes without options of the group, as a rule."""
 
+    MEANT: ClassVar[Mapping[str, str]] = {}  # commands by what others call them
+
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """As that of typer, which would convert the option for help too, even if it is not given."""
         add_help_option = self.add_help_option
         self.add_help_option = add_help_option and not (args and not args[0].startswith("-"))
+        words = tuple(args)
         try:
             return super().parse_args(ctx, args)
+        except _UsageError as error:
+            from aftbed.cli import usage  # noqa: PLC0415 - only of a mistake
+
+            raise usage.explained(error, ctx, words, {}) from error
         finally:
             self.add_help_option = add_help_option
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that the first word names. Raises ConfigError."""
+        if args[0] in self.commands:
+            return super().resolve_command(ctx, args)
+        from aftbed.cli import usage  # noqa: PLC0415 - only of a mistake
+
+        raise usage.no_such_command(ctx, args, self.MEANT)
+
+
+def _in_words(annotation: object) -> str:
+    """What a value of the type has to be; "" if that needs no words."""
+    try:
+        info, kind = _declared(annotation)
+    except _LeftToTyperError:
+        return ""
+    if get_origin(kind) in (list, tuple):
+        kind = get_args(kind)[0]
+    what = "a whole number" if kind is int else "a number" if kind is float else ""
+    if info.min is not None:
+        what += f" from {info.min:g} on" if info.max is None else f" from {info.min:g} to {info.max:g}"
+    return what
 
 
 def _value(annotation: object, default: object, word: object) -> object:

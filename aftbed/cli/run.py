@@ -32,17 +32,19 @@ from aftbed.cli.options import (
     Html,
     Json,
     Junit,
+    Quiet,
     Requests,
     Tolerance,
     check_file,
     check_range,
     check_seed,
+    choices,
     requirements,
     takes,
 )
-from aftbed.cli.views import RunView, open_view
+from aftbed.cli.views import PlainView, RunView
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.graph import Graph
+from aftbed.core.graph import PLACEMENTS, Graph
 from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.core.units import whole_milliseconds
@@ -50,9 +52,19 @@ from aftbed.ftm.compose import build, canonical
 from aftbed.functions.source import located
 from aftbed.inject.memory import refuse_unsafe
 from aftbed.inject.model import Fault, parse
+from aftbed.runtime import control
 from aftbed.runtime.control import Report
+from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.launch import Launched, launch, listen_on_loopback, options_for
-from aftbed.runtime.unix.options import CarRun, LoadRun, PolicyOptions, ReplayRun, Work, ftti_ms_of
+from aftbed.runtime.unix.options import (
+    CarRun,
+    LoadRun,
+    PolicyOptions,
+    ReplayRun,
+    RunOptions,
+    Work,
+    ftti_ms_of,
+)
 from aftbed.vehicle.can.bus_load import BITRATE_BPS, BITRATE_BPS_MAX, BITRATE_BPS_MIN
 
 if TYPE_CHECKING:
@@ -60,24 +72,32 @@ if TYPE_CHECKING:
     from aftbed.functions.request_file import GivenRequests
     from aftbed.runtime.unix.closed_loop import ClosedLoop
 
-POLICIES: Final = ("hold", "release", "latch")
+POLICIES: Final = ("hold", "release", "latch")  # the last one if left out
+SCENARIO: Final = "ccrs-50"  # if left out
 PACE_MIN, PACE_MAX = 0.01, 100.0
 LOAD_MAX: Final = 10_000_000
 PROCESSES_LOG_SHOWN: Final = 4000  # characters
 
 
-Placement = Annotated[str, typer.Option(help="process (one per brick) or replica.")]
-Pace = Annotated[str, typer.Option(help="real, a factor (4), or max (lockstep).")]
+Placement = Annotated[
+    str,
+    typer.Option(metavar=choices(PLACEMENTS), help="Which bricks share a process: none, a replica's, all."),
+]
+Pace = Annotated[
+    str | None, typer.Option(show_default="real", metavar="<real|max|FACTOR>", help="As 4; max is lockstep.")
+]
 
 
 class RunArguments(msgspec.Struct, frozen=True):
     """The options of `aftbed run`."""
 
     ftm: Ftm = "pbr"
-    scenario: Annotated[str, typer.Option(help="Name of a scenario, or a YAML file.")] = "ccrs-50"
+    scenario: Annotated[
+        str | None, typer.Option(show_default=SCENARIO, help="Name of a scenario, or a YAML file.")
+    ] = None
     app: App = None
     placement: Placement = "process"
-    pace: Pace = "real"
+    pace: Pace = None
     seed: Annotated[int, typer.Option(help="Seed of all random numbers of the run.")] = 0
     faults: Annotated[
         tuple[str, ...], typer.Option("--inject", help='E.g. "crash primary at checkpoint.sent nth 100".')
@@ -85,9 +105,9 @@ class RunArguments(msgspec.Struct, frozen=True):
     adaptations: Annotated[
         tuple[str, ...], typer.Option("--adapt", help='E.g. "compose lfr+tr at request 120".')
     ] = ()
-    recipe: Annotated[str, typer.Option(help="How each --adapt is carried out: drained or paper.")] = (
-        "drained"
-    )
+    recipe: Annotated[
+        str, typer.Option(metavar=choices(RECIPES), help="How each --adapt is carried out.")
+    ] = "drained"
     force: Annotated[
         bool, typer.Option("--force", help="Run, and --adapt, even where it does not suit the function.")
     ] = False
@@ -97,10 +117,17 @@ class RunArguments(msgspec.Struct, frozen=True):
     policy: Annotated[
         str | None, typer.Option(help="When the run adapts by itself: name of a policy, or a YAML file.")
     ] = None
-    approve: Annotated[str, typer.Option(help="What --policy proposes: auto (do it) or ask.")] = "auto"
+    approve: Annotated[
+        str, typer.Option(metavar="<auto|ask>", help="What --policy proposes: do it, or ask.")
+    ] = "auto"
     brake_policy: Annotated[
-        str, typer.Option(help="What the brake ECU does on lost requests: hold, release or latch.")
-    ] = "latch"
+        str | None,
+        typer.Option(
+            show_default=POLICIES[-1],
+            metavar=choices(POLICIES),
+            help="What the brake ECU does on lost requests.",
+        ),
+    ] = None
     record: Annotated[str | None, typer.Option(help="Keep the record of the run in this new directory.")] = (
         None
     )
@@ -158,7 +185,13 @@ class RunArguments(msgspec.Struct, frozen=True):
     trace: Annotated[Path | None, typer.Option(help="Write its nodes to this file, for Perfetto.")] = None
     junit: Junit = None
     html: Html = None
+    quiet: Quiet = False
     json: Json = False
+
+    @property
+    def silent(self) -> bool:
+        """Standard output is for the verdict alone."""
+        return self.json or self.quiet
 
 
 DEFAULTS: Final = RunArguments()
@@ -226,7 +259,7 @@ def execute(given: RunArguments) -> int:
         del log  # it may be large, and the run has it
         try:
             closed = make_loop(launched) if make_loop is not None else None
-            interrupted = _follow(launched, open_view(options, quiet=given.json), closed)
+            interrupted = _follow(launched, _open_view(options, quiet=given.silent), closed)
             page.close()
             launched.wait()
             from aftbed.cli.check import (  # noqa: PLC0415 - after the launch
@@ -241,12 +274,12 @@ def execute(given: RunArguments) -> int:
             if why_not := remember(launched.record):
                 text = f"aftbed check will ask for --trust: what was run cannot be remembered: {why_not}"
                 print(f"aftbed: note: {text}", file=sys.stderr)
-            verdict = judge_and_show(launched.record, OWN_RUN, as_json=given.json)
+            verdict = judge_and_show(launched.record, OWN_RUN, as_json=given.json, quiet=given.quiet)
             if given.record is not None:
                 keep_verdict(launched.record, verdict)
             if launched.trouble:
                 print(f"aftbed: trouble: {launched.trouble}", file=sys.stderr)
-            elif verdict.verdict == "inconclusive" and not given.json:
+            elif verdict.verdict == "inconclusive" and not given.silent:
                 _show_log(launched.record / "processes.log")
             writers = list[Callable[[], list[str]]]()
             if write_files is not None:
@@ -255,7 +288,7 @@ def execute(given: RunArguments) -> int:
                 writers.append(partial(write_junit, given.junit, verdict))
             if given.html is not None:
                 writers.append(partial(write_html, given.html, launched.record, verdict))
-            unwritten = [write for write in writers if not _written(write, as_json=given.json)]
+            unwritten = [write for write in writers if not _written(write, silent=given.silent)]
         finally:
             launched.remove()
     code = EXIT_CODES[verdict.verdict]
@@ -300,6 +333,8 @@ def _closed_loop(given: RunArguments) -> "Callable[[Launched], ClosedLoop] | Non
         return None
     from aftbed.runtime.unix.closed_loop import ClosedLoop, asked_for  # noqa: PLC0415 - only with --policy
 
+    if given.approve == "ask" and given.quiet:
+        raise ConfigError("--approve ask: --quiet prints no question; leave one of them out")
     policy = asked_for(given.policy, given.approve, canonical(given.ftm), as_json=given.json)
     if policy is None:
         return None
@@ -328,12 +363,13 @@ def _work(given: RunArguments) -> Work:
         files = _replay_files(given.replay, given.dbc, given.map_file)
         return ReplayRun(*files, pace, given.loop, duration_ms, given.bitrate)
     _refuse(given, OF_A_REPLAY, "only with --replay LOG: leave out")
-    if given.brake_policy not in POLICIES:
-        raise unknown("brake policy", given.brake_policy, POLICIES)
-    scenario = given.scenario
+    brake_policy = POLICIES[-1] if given.brake_policy is None else given.brake_policy
+    if brake_policy not in POLICIES:
+        raise unknown("brake policy", brake_policy, POLICIES)
+    scenario = SCENARIO if given.scenario is None else given.scenario
     if scenario.endswith((".yaml", ".yml")):
         scenario = str(Path(scenario).resolve())
-    return CarRun(scenario, pace, given.brake_policy, duration_ms, given.bitrate)
+    return CarRun(scenario, pace, brake_policy, duration_ms, given.bitrate)
 
 
 def _replay_files(log: str, dbc_name: str | None, map_name: str | None) -> tuple[str, str, str]:
@@ -360,11 +396,11 @@ def _log(given: RunArguments) -> bytes | None:
     return msgspec.msgpack.encode(read_for_replay(Path(given.replay), skip_bad=given.skip_bad))
 
 
-def _pace(text: str) -> float | None:
+def _pace(text: str | None) -> float | None:
     """The pace as a factor; None is lockstep."""
     if text == "max":
         return None
-    if text == "real":
+    if text is None or text == "real":
         return 1.0
     try:
         pace = float(text)
@@ -376,9 +412,9 @@ def _pace(text: str) -> float | None:
 
 
 def _load(text: str) -> LoadRun:
-    count, _, rate = text.partition("@")
+    count, at, rate = text.partition("@")
     try:
-        load = LoadRun(int(count), float(rate or 0))
+        load = LoadRun(int(count), float(rate) if at else 0.0)
     except ValueError:
         load = LoadRun(0, 0.0)
     if not (1 <= load.count <= LOAD_MAX and 0 <= load.rate_hz <= RATE_HZ_MAX):
@@ -447,6 +483,26 @@ def _page(given: RunArguments, private: Path) -> AbstractContextManager[None]:
 # -- while it runs --------------------------------------------------------------------------------
 
 
+@contextlib.contextmanager
+def _open_view(options: RunOptions, *, quiet: bool) -> Iterator[RunView]:
+    """The view that suits standard output; `quiet` shows nothing."""
+    if quiet:
+        yield RunView()
+        return
+    if not sys.stdout.isatty():
+        yield PlainView(options)
+        return
+    from aftbed.cli.live_view import LiveView  # noqa: PLC0415 - only on a terminal
+    from aftbed.cli.screen import opened  # noqa: PLC0415 - the same
+
+    screen = opened()
+    if screen is None:
+        yield PlainView(options)
+        return
+    with screen, contextlib.closing(LiveView(options, screen)) as view:
+        yield view
+
+
 def _follow(launched: Launched, view: AbstractContextManager[RunView], closed: "ClosedLoop | None") -> bool:
     """Show the reports until the run ends; True if the user interrupted it. A second Ctrl-C kills the run."""
     interrupted = False
@@ -463,17 +519,15 @@ def _follow(launched: Launched, view: AbstractContextManager[RunView], closed: "
         with view as shown:
             if closed is not None:
                 closed.show = shown.event
-            for report in _reports(launched, closed):
-                match report.kind:
-                    case "telemetry":
-                        shown.telemetry(report.data)
-                    case "cycle":
-                        shown.cycle(json.loads(report.data))
-                    case "event":
-                        event = json.loads(report.data)
-                        shown.event(event)
-                        if closed is not None:
-                            closed.on_event(event)
+                shown.decide, closed.reads_input = closed.decide, not shown.takes_keys
+            for report in _reports(launched, closed, shown):
+                if report.kind != control.EVENT:
+                    shown.report(report)
+                    continue
+                event = json.loads(report.data)
+                shown.event(event)
+                if closed is not None:
+                    closed.on_event(event)
             if closed is not None:
                 closed.close()
     finally:
@@ -482,12 +536,15 @@ def _follow(launched: Launched, view: AbstractContextManager[RunView], closed: "
     return interrupted
 
 
-def _reports(launched: Launched, closed: "ClosedLoop | None") -> Iterator[Report]:
-    """The reports of the run; between two of them, a closed loop observes."""
-    reports = launched.reports()
+def _reports(launched: Launched, closed: "ClosedLoop | None", shown: RunView) -> Iterator[Report]:
+    """The reports of the run; between two of them a closed loop observes, and the view is attended to."""
+    reports, line = launched.reports(), launched.line.fileno()
     while True:
-        if closed is not None:
-            closed.wait(launched.line.fileno())
+        shown.attend()
+        descriptors = (line, *shown.descriptors)
+        wait = closed.wait if closed is not None else partial(linux.readable, seconds=shown.wait_s)
+        if line not in wait(descriptors):
+            continue
         report = next(reports, None)
         if report is None:
             return
@@ -509,14 +566,14 @@ def _files(given: RunArguments) -> Callable[[Path], list[str]] | None:
     return lambda record: list(map(str, export(read_record(record), files)))
 
 
-def _written(write: Callable[[], list[str]], *, as_json: bool) -> bool:
+def _written(write: Callable[[], list[str]], *, silent: bool) -> bool:
     """False if a file could not be written. The verdict is printed all the same."""
     try:
         lines = write()
     except ConfigError as error:
         print(f"aftbed: trouble: {error}", file=sys.stderr)
         return False
-    if not as_json:
+    if not silent:
         print("\n".join(lines))
     return True
 

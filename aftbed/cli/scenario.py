@@ -31,7 +31,7 @@ SUBCOMMANDS: Final[CommandTable] = {
     ),
 }
 
-scenario = typer.Typer(cls=group_of(SUBCOMMANDS))
+scenario = typer.Typer(cls=group_of(SUBCOMMANDS, "scenario"))
 
 Name = Annotated[str, typer.Argument(help="A scenario, a row of a table (r152:m1-60), or a YAML file.")]
 
@@ -151,7 +151,7 @@ def run(
     name: Name,
     ftm: Ftm = "pbr",
     placement: Placement = "process",
-    pace: Pace = "real",
+    pace: Pace = None,
     seed: Seed = 0,
     faults: Annotated[
         list[str] | None, typer.Option("--inject", help='E.g. "crash primary at server.enter nth 100".')

@@ -48,7 +48,7 @@ class FttiArguments(msgspec.Struct, frozen=True):
         typer.Option(help=f"{', '.join(FunctionFault)}; several are separated by commas. omission."),
     ] = ()
     brake_policy: Annotated[
-        str, typer.Option(help="What the brakes do without a request: latch, release or hold.")
+        str, typer.Option(metavar="<latch|release|hold>", help="What the brakes do without a request.")
     ] = "latch"
     fhti: Annotated[
         Path | None,

@@ -39,7 +39,8 @@ def import_(
         typer.Option(help="Directory of the scenario files. Of a DIR nothing is written without it."),
     ] = None,
     expect: Annotated[
-        str, typer.Option(help="The expected outcome of each drive: stop, no_collision or no_braking.")
+        str,
+        typer.Option(metavar="<stop|no_collision|no_braking>", help="The outcome that each drive must have."),
     ] = "no_collision",
     duration: Annotated[
         float | None,

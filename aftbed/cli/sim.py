@@ -33,6 +33,7 @@ from aftbed.cli.options import (
     Tolerance,
     check_file,
     check_seed,
+    choices,
     jobs_of,
     print_json,
     takes,
@@ -40,7 +41,7 @@ from aftbed.cli.options import (
 from aftbed.cli.request_options import RequestSource, first_requests
 from aftbed.cli.views import show_verdict
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.graph import Graph
+from aftbed.core.graph import PLACEMENTS, Graph
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.core.units import duration
@@ -94,7 +95,9 @@ class SimArguments(msgspec.Struct, frozen=True):
     seeds: Annotated[str | None, typer.Option(help="A..B: a run for each, both ends included.")] = None
     ftm: Annotated[str | None, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...; pbr if left out.")] = None
     app: App = None
-    placement: Annotated[str | None, typer.Option(help="process (default), replica or single.")] = None
+    placement: Annotated[
+        str | None, typer.Option(metavar=choices(PLACEMENTS), help="process if left out.")
+    ] = None
     count: Annotated[
         int | None, typer.Option(help="Requests of a run; if left out 100, or all of a file.")
     ] = None
@@ -110,13 +113,14 @@ class SimArguments(msgspec.Struct, frozen=True):
     ] = None
     faults: Annotated[
         tuple[str, ...],
-        typer.Option("--inject", "--faults", help='E.g. "crash primary at server.exit nth 3".'),
+        typer.Option("--inject", help='E.g. "crash primary at server.exit nth 3".'),
     ] = ()
     adaptations: Annotated[
         tuple[str, ...], typer.Option("--adapt", help='E.g. "to lfr+tr at request 20".')
     ] = ()
     recipe: Annotated[
-        str | None, typer.Option(help="How each --adapt is carried out: drained (default) or paper.")
+        str | None,
+        typer.Option(metavar=choices(RECIPES), help="How each --adapt is carried out; drained if left out."),
     ] = None
     force: Annotated[
         bool, typer.Option("--force", help="Begin each --adapt even if it would be refused.")
@@ -428,7 +432,7 @@ def _command(given: SimArguments) -> str:
         ("--requests", given.requests),
         ("--expect", given.expect),
         ("--tolerance", None if given.tolerance is None else repr(given.tolerance)),
-        *(("--faults", text) for text in given.faults),
+        *(("--inject", text) for text in given.faults),
         *(("--adapt", text) for text in given.adaptations),
         ("--recipe", given.recipe),
     ]

@@ -4,121 +4,113 @@ rich is imported only where the output is a terminal. `aftbed run` imports this 
 supervisor, so nothing else that is large is imported here.
 """
 
-import sys
-from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Final
 
 import msgspec
 
+from aftbed.cli.colour import Style, painted
 from aftbed.cli.options import print_json
 from aftbed.core.errors import shown
+from aftbed.runtime import control
+from aftbed.runtime.control import Report, ServiceState
 from aftbed.runtime.unix.options import RunOptions
 from aftbed.vehicle.can.bus_model import CHANNEL, HOST
 from aftbed.vehicle.plant import Telemetry
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
-
     from aftbed.judge.verdict import Verdict
+    from aftbed.vehicle.aeb.messages import Sight
 
-EVENTS_SHOWN: Final = 10
 STAGES: Final = ("-", "WARN", "PARTIAL", "FULL")
 PLAIN_PERIOD_MS: Final = 500
 KMH_PER_MS: Final = 3.6
-ROAD_M: Final = 60  # drawn, one character a metre
+STYLES_OF_VERDICTS: Final = {"pass": Style.GOOD, "fail": Style.SERIOUS, "inconclusive": Style.WARN}
+STYLES_OF_CHECKS: Final = {"pass": Style.PLAIN, "fail": Style.SERIOUS, "unknown": Style.WARN}
 
 
 # -- a run while it lives -------------------------------------------------------------------------
 
 
 class RunView:
-    """Shows a live run. This one shows nothing."""
+    """Shows a live run. This one shows nothing.
 
-    def telemetry(self, data: bytes) -> None:
-        """A `Telemetry`, encoded."""
+    `descriptors`: when one is readable, or `wait_s` seconds have passed, `attend` is worth calling.
+    `decide` is called with the answer to a question, if the view `takes_keys`.
+    """
 
-    def cycle(self, cycle_us: float | None) -> None:
-        """The latest cycle time at the client, from request to reply."""
+    def __init__(self) -> None:
+        self.decide: Callable[[str], None] = lambda answer: None
+
+    @property
+    def descriptors(self) -> tuple[int, ...]:
+        return ()
+
+    @property
+    def wait_s(self) -> float | None:
+        return None
+
+    @property
+    def takes_keys(self) -> bool:
+        return False
+
+    def telemetry(self, car: Telemetry) -> None:
+        """What the car of a drive does."""
+
+    def sight(self, seen: "Sight") -> None:
+        """What the function sees in a replay."""
+
+    def state(self, state: ServiceState) -> None:
+        """What serves now."""
 
     def event(self, event: dict[str, object]) -> None:
         """An event of the run: `t_ms`, `event`, `text`."""
 
+    def attend(self) -> None:
+        """Look after the terminal: keys, its size, what is to be drawn."""
 
-@contextmanager
-def open_view(options: RunOptions, *, quiet: bool) -> Iterator[RunView]:
-    """The view that suits standard output; `quiet` shows nothing."""
-    if quiet:
-        yield RunView()
-    elif not sys.stdout.isatty():
-        yield PlainView(options)
-    else:
-        from rich.live import Live  # noqa: PLC0415 - only on a terminal
+    def report(self, report: Report) -> None:
+        """Show what the run reports, except for its events."""
+        match report.kind:
+            case control.TELEMETRY:
+                self.telemetry(msgspec.msgpack.decode(report.data, type=Telemetry))
+            case control.SIGHT:
+                from aftbed.vehicle.aeb.messages import Sight  # noqa: PLC0415 - only of a replay
 
-        view = LiveView(options)
-        with Live(get_renderable=view.render, refresh_per_second=20):
-            yield view
+                self.sight(msgspec.msgpack.decode(report.data, type=Sight))
+            case control.STATE:
+                self.state(msgspec.msgpack.decode(report.data, type=ServiceState))
 
 
 class PlainView(RunView):
     """A line per event, and one for the car every PLAIN_PERIOD_MS."""
 
     def __init__(self, options: RunOptions) -> None:
+        super().__init__()
         print(f"run {options.run}: {options.ftm}, {options.placement}, seed {options.seed}", flush=True)
         if options.port:
-            print(_bus(options), flush=True)
+            print(bus_line(options), flush=True)
         self._next_ms = 0
 
-    def telemetry(self, data: bytes) -> None:
-        telemetry = msgspec.msgpack.decode(data, type=Telemetry)
-        if telemetry.t_ms >= self._next_ms:
-            self._next_ms = telemetry.t_ms + PLAIN_PERIOD_MS
-            print(_car(telemetry), flush=True)
+    def telemetry(self, car: Telemetry) -> None:
+        if car.t_ms >= self._next_ms:
+            self._next_ms = car.t_ms + PLAIN_PERIOD_MS
+            print(car_line(car), flush=True)
+
+    def sight(self, seen: "Sight") -> None:
+        if seen.t_ms >= self._next_ms:
+            self._next_ms = seen.t_ms + PLAIN_PERIOD_MS
+            print(sight_line(seen), flush=True)
 
     def event(self, event: dict[str, object]) -> None:
-        print(f"[{event['t_ms']:>10} ms] {event['event']}: {event['text']}", flush=True)
+        print(shown(event_line(event)), flush=True)
 
 
-class LiveView(RunView):
-    """Speed, gap, TTC, stage, the roles of the replicas, and the last events; redrawn 20 times a second."""
-
-    def __init__(self, options: RunOptions) -> None:
-        self._title = f"aftbed run {options.run}: {options.ftm}, {options.placement}"
-        self._bus = [_bus(options)] if options.port else []
-        self._events: deque[str] = deque(maxlen=EVENTS_SHOWN)
-        self._telemetry: Telemetry | None = None
-        self._roles = "a leads, b backs up" if options.ftm != "none" else "a alone"
-        self._cycle = ""
-
-    def telemetry(self, data: bytes) -> None:
-        self._telemetry = msgspec.msgpack.decode(data, type=Telemetry)
-
-    def cycle(self, cycle_us: float | None) -> None:
-        self._cycle = "" if cycle_us is None else f"    cycle {cycle_us:.0f} us"
-
-    def event(self, event: dict[str, object]) -> None:
-        self._events.append(f"{event['t_ms']:>10} ms  {event['event']:<13} {event['text']}")
-        if event["event"] == "roles":
-            self._roles = str(event["text"])
-
-    def render(self) -> "RenderableType":
-        """The panel as it is now."""
-        from rich.panel import Panel  # noqa: PLC0415 - only on a terminal
-        from rich.text import Text  # noqa: PLC0415 - only on a terminal
-
-        car = _car(self._telemetry) if self._telemetry else "waiting for the car"
-        road = _road(self._telemetry.gap_m if self._telemetry else None)
-        lines = [car, road, f"replicas: {self._roles}{self._cycle}", *self._bus, "", *self._events]
-        text = Text("\n".join(lines), no_wrap=True, overflow="ellipsis")
-        return Panel(text, title=self._title, height=EVENTS_SHOWN + 6 + len(self._bus))
-
-
-def _bus(options: RunOptions) -> str:
+def bus_line(options: RunOptions) -> str:
     return f"bus: {CHANNEL} at {HOST}:{options.port}, for clients of socketcand"
 
 
-def _car(t: Telemetry) -> str:
+def car_line(t: Telemetry) -> str:
     gap = "no target" if t.gap_m is None else f"gap {t.gap_m:6.2f} m"
     ttc = "" if t.ttc_s is None else f"  TTC {t.ttc_s:5.2f} s"
     return (
@@ -127,21 +119,44 @@ def _car(t: Telemetry) -> str:
     )
 
 
-def _road(gap_m: float | None) -> str:
-    """The car, the gap and the obstacle."""
-    if gap_m is None:
-        return ">" + "." * ROAD_M
-    return ">" + "." * min(ROAD_M, max(0, round(gap_m))) + "#"
+def event_line(event: dict[str, object]) -> str:
+    return f"[{event['t_ms']:>10} ms] {event['event']}: {event['text']}"
+
+
+def requests_line(state: ServiceState) -> str:
+    """What the client has counted, "" if it has not."""
+    if state.requests is None:
+        return ""
+    cycle = "" if state.cycle_us is None else f", cycle {state.cycle_us:.0f} us"
+    return f"{state.requests.sent} sent, {state.requests.answered} answered{cycle}"
+
+
+def sight_line(seen: "Sight") -> str:
+    speed = "speed unknown" if seen.speed_ms is None else f"{seen.speed_ms * KMH_PER_MS:5.1f} km/h"
+    gap = "no target" if seen.range_m is None else f"gap {seen.range_m:6.2f} m"
+    ttc = "" if seen.ttc_s is None else f"  TTC {seen.ttc_s:5.2f} s"
+    return (
+        f"{seen.t_ms / 1e3:6.2f} s  {speed}  {'radar unknown' if seen.targets is None else gap}{ttc}"
+        f"  {STAGES[seen.stage]:7}  asks for {seen.deceleration_ms2:.1f} m/s2"
+    )
 
 
 # -- a verdict ------------------------------------------------------------------------------------
 
 
-def show_verdict(verdict: "Verdict", *, as_json: bool) -> None:
-    """Print it to standard output."""
+def show_verdict(verdict: "Verdict", *, as_json: bool, quiet: bool = False) -> None:
+    """Print it to standard output; `quiet`: without what was done, sent and counted."""
     if as_json:
         print_json(verdict)
         return
+    if not quiet:
+        _show_run(verdict)
+    for reason in verdict.reasons:
+        print(shown(f"  because    {reason}"))
+    print(painted(f"verdict: {verdict.verdict}", STYLES_OF_VERDICTS[verdict.verdict]))
+
+
+def _show_run(verdict: "Verdict") -> None:
     requests = verdict.requests
     print(shown(f"{verdict.scenario} under {verdict.ftm} ({verdict.placement}), seed {verdict.seed}"))
     print(
@@ -182,10 +197,8 @@ def show_verdict(verdict: "Verdict", *, as_json: bool) -> None:
         print(shown(f"  fault      {fault.fault}: {fault.receipt.value}"))
     if verdict.verifies:
         print(f"  verifies   {', '.join(verdict.verifies)}")
-    print("  checks     " + ", ".join(f"{name} {found}" for name, found in verdict.checks.items()))
-    for reason in verdict.reasons:
-        print(shown(f"  because    {reason}"))
-    print(f"verdict: {verdict.verdict}")
+    checks = (painted(f"{name} {found}", STYLES_OF_CHECKS[found]) for name, found in verdict.checks.items())
+    print("  checks     " + ", ".join(checks))
 
 
 def _show_policy(verdict: "Verdict") -> None:
@@ -203,7 +216,7 @@ def _show_vehicle(verdict: "Verdict") -> None:
         if verdict.replay is not None:
             print(f"  replay     {msgspec.json.encode(verdict.replay).decode()}")
     elif car.collision:
-        print(f"  car        COLLISION at {car.impact_speed_kmh:.1f} km/h")
+        print(f"  car        {painted(f'COLLISION at {car.impact_speed_kmh:.1f} km/h', Style.ALARM)}")
     elif car.stop_gap_m is not None:
         most = f"{car.max_deceleration_ms2:.1f} m/s2 at most"
         print(f"  car        stopped {car.stop_gap_m:.2f} m short, {most}")

@@ -49,7 +49,7 @@ def opened_archive(
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (zipfile.BadZipFile, zlib.error, EOFError, struct.error, ValueError, LookupError) as error:
-        raise ConfigError(f"{path}: found no zip archive, as {what} is, or a broken one: {error}") from error
+        raise ConfigError(f"{path}: found no zip archive, as {what} is, or a broken one") from error
     except (NotImplementedError, RuntimeError) as error:  # a version of the format, encrypted
         raise ConfigError(f"{path}: its archive cannot be read: {error}") from error
 

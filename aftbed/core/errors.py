@@ -5,8 +5,9 @@ must not be believed, `HarnessError` for trouble of the testbed itself (exit cod
 failed `assert` is a bug of ours: it ends the node, because fail-silence is the fault model.
 """
 
+import contextlib
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Final
 
 FUNCTION_FAILED: Final = "the function failed: "  # begins why its node has stopped
@@ -18,6 +19,26 @@ class AftbedError(Exception):
 
 class ConfigError(AftbedError):
     """The user asked for something that does not exist or is not allowed: exit code 2."""
+
+
+class FileKeyError(ConfigError):
+    """What stands at `key` of a file, as `faults[0].name`, is not allowed.
+
+    The reader of the file adds its name, line and column: `core.yaml_file.in_file`.
+    """
+
+    def __init__(self, key: str, reason: object) -> None:
+        super().__init__(f"{key}: {reason}")
+        self.key = key
+
+
+@contextlib.contextmanager
+def at_key(key: str) -> Iterator[None]:
+    """A ConfigError within it is one about what stands at `key` of a file."""
+    try:
+        yield
+    except ConfigError as error:
+        raise FileKeyError(key, error) from error
 
 
 class ScriptError(ConfigError):
@@ -70,7 +91,8 @@ def unknown(
     `synonyms`: what words mean that others use for the same.
     """
     names = sorted(allowed)
-    meant = (synonyms or {}).get(found)
-    near = [meant] if meant in names else difflib.get_close_matches(found, names, n=1, cutoff=0.5)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
+    by_lower = {name.lower(): name for name in names}
+    meant = (synonyms or {}).get(found.lower())
+    near = [meant] if meant in names else difflib.get_close_matches(found.lower(), by_lower, n=1, cutoff=0.5)
+    hint = f"; did you mean {by_lower[near[0].lower()]!r}?" if near else ""
     return ConfigError(f"unknown {what} {found!r}{hint} (one of: {', '.join(names)})")

@@ -8,6 +8,7 @@ from aftbed.core.errors import ConfigError
 DURATION_MS_MAX: Final = 3_600_000
 _UNITS_MS: Final = {"ms": 1, "s": 1000}
 _DURATION: Final = re.compile(r"([0-9]{1,10}(?:\.[0-9]{1,6})?)(ms|s)")
+_PLAIN: Final = re.compile(r"[1-9][0-9]{0,9}")  # without a unit
 
 
 def milliseconds(what: str, text: str) -> float:
@@ -38,7 +39,8 @@ def duration(ms: float) -> str:
 
 
 def _refusal(what: str, text: str) -> ConfigError:
+    meant = f"; did you mean {text}ms or {text}s?" if _PLAIN.fullmatch(text) else ""
     return ConfigError(
         f"{what} {text[:40]!r}: a positive number with its unit is allowed, as 50ms or 2s,"
-        f" up to {DURATION_MS_MAX // _UNITS_MS['s']}s"
+        f" up to {DURATION_MS_MAX // _UNITS_MS['s']}s{meant}"
     )

@@ -37,7 +37,10 @@ def parse(expression: str) -> tuple[str, ...]:
     expression = expression.lower()
     if expression == NONE:
         return ()
-    names = tuple(expression.split("+"))
+    names = tuple(name.strip() for name in expression.split("+"))
+    if "," in expression:
+        meant = "+".join(name.strip() for name in expression.split(","))
+        raise ConfigError(f"FTM {expression!r}: mechanisms are joined by '+', as {meant!r}")
     for name in names:
         if registry.find(name) is None:
             raise unknown("FTM", name, (NONE, *registry.names()))

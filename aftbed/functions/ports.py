@@ -36,7 +36,8 @@ from aftbed.core.application import (
     WrittenAccess,
     access_of,
 )
-from aftbed.core.errors import ConfigError, PeerError
+from aftbed.core.errors import ConfigError, FileKeyError, PeerError
+from aftbed.core.yaml_file import in_file
 
 Unit = Literal["s", "ms", "us", "ns"]
 Value = bool | int | float
@@ -249,14 +250,15 @@ def bind(path: Path, file: PortsFile, model: Path, variables: Iterable[Variable]
 
     `has_state`: whether the FMU says that its state can be captured. Raises ConfigError.
     """
-    return _Binding(path, file, model, {one.name: one for one in variables}).bound(has_state)
+    with in_file(path):
+        return _Binding(file, model, {one.name: one for one in variables}).bound(has_state)
 
 
 class _Binding:
-    """Each error names the file, the key, what was found and what is allowed."""
+    """Each error names the key, what was found and what is allowed."""
 
-    def __init__(self, path: Path, file: PortsFile, model: Path, variables: Mapping[str, Variable]) -> None:
-        self._path, self._file, self._model, self._variables = path, file, model, variables
+    def __init__(self, file: PortsFile, model: Path, variables: Mapping[str, Variable]) -> None:
+        self._file, self._model, self._variables = file, model, variables
 
     def bound(self, has_state: bool) -> Ports:
         self._check_lengths()
@@ -348,7 +350,7 @@ class _Binding:
             try:
                 access = access_of(declared.state_access)
             except ConfigError as error:
-                raise ConfigError(f"{self._path}: characteristics.state_access: {error}") from None
+                raise FileKeyError("characteristics.state_access", error) from None
         return Characteristics(deterministic=declared.deterministic, state_access=access)
 
     def _named(self, key: str, name: str, wanted: str, names: Sequence[str]) -> Variable:
@@ -374,7 +376,7 @@ class _Binding:
             raise self._error(f"{key}.type", found, f"{_words(types) or 'none'} for {what}")
 
     def _error(self, key: str, found: str, allowed: str) -> ConfigError:
-        return ConfigError(f"{self._path}: {key}: found {found}, allowed is {allowed}")
+        return FileKeyError(key, f"found {found}, allowed is {allowed}")
 
 
 def _holds(variable: Variable, value: float) -> bool:

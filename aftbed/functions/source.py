@@ -147,8 +147,12 @@ def located(text: str, folder: Path | None = None) -> str:
             first, *rest = source.words
             if "/" in first:
                 first = str((here / first).absolute())
+            if Path(first).is_file() and first.endswith(".py"):
+                raise ConfigError(f"{text}: which class of it? {text}:CLASS is allowed")
+            if Path(first).is_dir():
+                raise ConfigError(f"{text}: is a directory; {FORMS}")
             if shutil.which(first) is None:
-                raise ConfigError(f"{text}: {first} is no program that can be executed; {FORMS}")
+                raise ConfigError(f"{first} is no program that can be executed; {FORMS}")
             words = [str((here / word).absolute()) if (here / word).is_file() else word for word in rest]
             return _versioned(shlex.join([first, *words]), source.version)
         case _:

@@ -43,6 +43,20 @@ WHEN_KEYS: Final = ("at", "nth", "after", "when")
 REPEAT_KEYS: Final = (PERMANENT, INTERMITTENT)
 _VALUE_WORDS: Final = {INTERMITTENT: 2, "when": 3}  # of all other keys the value is one word
 _TIME: Final = re.compile(r"[0-9.]+(us|ms|s)")
+_UNITS: Final = ("us", "ms", "s")
+_NUMBER: Final = re.compile(r"[0-9.]+")
+_MEANT: Final = {  # keys by what others call them
+    "@": "at",
+    "on": "at",
+    "in": "after",
+    "p": INTERMITTENT,
+    "every": INTERMITTENT,
+    "chance": INTERMITTENT,
+    "always": PERMANENT,
+    "during": "for",
+    "if": "when",
+    "number": "nth",
+}
 _WHOLE: Final = re.compile(r"[0-9]{1,12}")
 
 
@@ -60,11 +74,15 @@ class FaultWords:
     def __init__(self, words: Sequence[str], keys: Sequence[str]) -> None:
         self.text = " ".join(words)
         self.name, self.subject, *rest = words
+        if self.subject in keys:
+            raise ConfigError(
+                f"fault {self.text!r}: what it strikes is missing: {self.name} TARGET {self.subject} ..."
+            )
         self._values: dict[str, str] = {}
         while rest:
             key = rest.pop(0)
             if key not in keys:
-                raise unknown(f"word in fault {self.text!r}:", key, keys)
+                raise self._stray(key, keys)
             if key in self._values:
                 raise ConfigError(f"fault {self.text!r}: {key!r} twice")
             alone = key == BYTE and (not rest or rest[0].isalpha())
@@ -76,6 +94,16 @@ class FaultWords:
                     f"fault {self.text!r}: 'at' is followed by an event, 'after {rest[0]}' by a time"
                 )
             self._values[key] = " ".join(rest.pop(0) for _ in range(count))
+
+    def _stray(self, word: str, keys: Sequence[str]) -> ConfigError:
+        """`word` stands where a key is due."""
+        for key, value in self._values.items():
+            if word in _UNITS and _NUMBER.fullmatch(value):
+                return ConfigError(f"fault {self.text!r}: a duration is one word: '{key} {value}{word}'")
+        if self._values.get("at") == "request" and _WHOLE.fullmatch(word):
+            meant = f"'at server.enter nth {word}', or another event"
+            return ConfigError(f"fault {self.text!r}: 'at' is followed by an event: {meant}")
+        return unknown(f"word in fault {self.text!r}:", word, keys, _MEANT)
 
     def __contains__(self, key: str) -> bool:
         return key in self._values
@@ -205,6 +233,13 @@ def check_pattern(pattern: BitPattern) -> None:
             raise ConfigError(f"stuck {at}={value}: a bit from 0 to {BIT_MAX}, and 0 or 1, are allowed")
         case _:
             return
+
+
+def lacks_bits(pattern: BitPattern, size_bits: int) -> bool:
+    """Whether data of so many bits has not all bits that the pattern names."""
+    if isinstance(pattern, StuckBit):
+        return pattern.at >= size_bits
+    return bits_to_flip(pattern, bytes(size_bits // 8), 0) is None
 
 
 def bits_to_flip(pattern: BitPattern, data: bytes, draw: int) -> tuple[int, ...] | None:

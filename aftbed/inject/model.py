@@ -126,6 +126,8 @@ def read(words: Sequence[str]) -> Fault:
             return Fault(cast("FaultAction", found.action), found.target, found.trigger, found.persistence)
     if len(words) < 2:
         raise ConfigError(f"fault {' '.join(words)!r}: expected {GRAMMAR}")
+    if words[1] in NAMES:
+        raise ConfigError(f"fault {' '.join(words)!r}: the kind comes first: '{words[1]} {words[0]}'")
     raise unknown("fault", words[0], NAMES, SYNONYMS)
 
 

@@ -26,7 +26,7 @@ from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.events import Event
 from aftbed.core.journal import Record
 from aftbed.ftm.server import Server
-from aftbed.inject.grammar import BitPattern, Byte, StuckBit, bit_names, bits_to_flip
+from aftbed.inject.grammar import BitPattern, Byte, bit_names, bits_to_flip, lacks_bits
 from aftbed.inject.receipts import Receipt, ReceiptState, fault_and_bits
 
 SHARED_BYTES: Final = 1 << 16  # memory that is never touched costs nothing
@@ -46,8 +46,7 @@ def field_with_bits(name: str, pattern: BitPattern, fields: tuple[Field, ...]) -
     Raises ConfigError where there is none, or it does not have the bits of `pattern`.
     """
     field = field_named(name, fields)
-    behind = pattern.at >= field.size_bits if isinstance(pattern, StuckBit) else False
-    if behind or bits_to_flip(pattern, bytes(field.size_bits // 8), 0) is None:
+    if lacks_bits(pattern, field.size_bits):
         size = field.size_bits
         unit, count = ("bytes", size // 8) if isinstance(pattern, Byte) else ("bits", size)
         has = f"it is {field.kind}, and has {unit} 0 to {count - 1}"

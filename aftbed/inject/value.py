@@ -50,11 +50,14 @@ from aftbed.inject.grammar import (
     bit_names,
     bits_to_flip,
     check_pattern,
+    lacks_bits,
     read_pattern,
     with_flipped,
 )
 from aftbed.inject.kind import Alteration, AnyFault, FaultKind, Injection, RunControl
 from aftbed.inject.receipts import Receipt, ReceiptState, fault_and_bits, more_times
+from aftbed.vehicle.aeb.function import STATE_BYTES
+from aftbed.vehicle.aeb.messages import REPLY_BYTES_MAX, REQUEST_BYTES_MAX
 
 BITFLIP: Final = "bitflip"
 MEMORY: Final = "memory"  # the place of a bit flip outside of all values: see `memory`
@@ -81,6 +84,12 @@ FLIPPED_AT: Final = {  # the events at which the value is in hand; the first is 
     ValuePlace.LOG: (Event.REPLY_STORED, Event.DEDUPE_HIT, Event.CHECKPOINT_APPLIED),
 }
 LoggedReplies = tuple[int, list[tuple[int, bytes]]]  # as a Protocol captures it: the last id, ids and replies
+_BRAKE_BYTES_MAX: Final = {  # of the built-in function
+    ValuePlace.RESULT: REPLY_BYTES_MAX,
+    ValuePlace.STATE: STATE_BYTES,
+    ValuePlace.REQUEST: REQUEST_BYTES_MAX,
+    ValuePlace.LOG: REPLY_BYTES_MAX,
+}
 _USES: Final = (Event.SERVER_ENTER, Event.STATE_CAPTURED)  # of a state that was hit
 
 
@@ -123,6 +132,8 @@ class ValueFlip(FaultKind, frozen=True, tag=BITFLIP):
     def check(self, fault: AnyFault, graph: Graph) -> None:
         """The target has to have the value in hand at the event, in the roles that it can have."""
         check_pattern(self.pattern)
+        if not any(brick.application for brick in graph.bricks):  # of others the sizes are not known here
+            self._check_size()
         roles = targets.possible_roles(fault.target, graph)
         event = event_named(fault.event)
         places = FLIPPED_AT[self.place]
@@ -136,6 +147,12 @@ class ValueFlip(FaultKind, frozen=True, tag=BITFLIP):
             raise unknown(
                 f"event for a bit of the {self.place.value} in {fault.target}:", event.label, emitted
             )
+
+    def _check_size(self) -> None:
+        bytes_max = _BRAKE_BYTES_MAX.get(self.place)
+        if bytes_max is not None and lacks_bits(self.pattern, 8 * bytes_max):
+            has = f"bytes 0 to {bytes_max - 1} at most, bits 0 to {8 * bytes_max - 1}"
+            raise ConfigError(f"{self.pattern} of {self.place.value}: the brake's has {has}")
 
     def waits_in(self, fault: AnyFault, roles: targets.Roles) -> str | None:
         return targets.emitting_brick_of(roles, fault.event, roles.replica(fault.target))

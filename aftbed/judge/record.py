@@ -170,11 +170,13 @@ def read_record(path: Path, *, in_memory: bool = False) -> RunRecord:
     what = f"{path / 'run.json'}: not the options of a run"
     options = _exactly(given | {"private": "", "listener": -1, "log": -1}, RunOptions, what)
     check_requirements(f"{path / 'run.json'}: verifies", options.verifies)
-    _check_mechanism(path / "run.json", options)
     try:
         started = msgspec.convert(about.get("started_ns"), int)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{what}: started_ns: {error}") from None
+    adaptations = _adaptations(path)
+    for ftm, one in ((options.ftm, "run.json"), *((a.ftm, HISTORY_NAME) for a in adaptations)):
+        _check_mechanism(path / one, ftm, options.packages)
     history = _history(path / "journal", in_memory=in_memory)
     end = _end(path / "end.json") if (path / "end.json").exists() else None
     faults = (
@@ -192,7 +194,7 @@ def read_record(path: Path, *, in_memory: bool = False) -> RunRecord:
         history,
         end,
         faults,
-        _adaptations(path),
+        adaptations,
         _drive(options, end),
         read_policy_report(path),
         tuple(read_proposals(path)),
@@ -206,13 +208,13 @@ def read_record(path: Path, *, in_memory: bool = False) -> RunRecord:
     )
 
 
-def _check_mechanism(file: Path, options: RunOptions) -> None:
+def _check_mechanism(file: Path, ftm: str, packages: tuple[str, ...]) -> None:
     """Raise ConfigError if this installation cannot build the graph that ran, and say what it lacks."""
     try:
-        parse(options.ftm)
+        parse(ftm)
     except ConfigError as error:
-        packages = " and ".join(options.packages)
-        needed = f"; the run had it of {packages}: install that to judge it" if packages else ""
+        theirs = " and ".join(packages)
+        needed = f"; the run had it of {theirs}: install that to judge it" if theirs else ""
         raise ConfigError(f"{file}: ftm: {error}{needed}") from None
 
 

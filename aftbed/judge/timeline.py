@@ -39,9 +39,9 @@ from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import fault_and_bits
 from aftbed.judge.record import RunRecord
 from aftbed.runtime.unix.options import LoadRun
+from aftbed.runtime.unix.run_directory import EVENT_LOG_NAME
 from aftbed.vehicle.aeb.messages import AebInput, decode_request
 
-EVENT_LOG_NAME: Final = "events.jsonl"
 EVENT_LOG_BYTES_MAX: Final = 1 << 30
 FAILURES: Final = frozenset(
     (Event.DETECTED_STOP, Event.FOLLOWER_DIVERGED, Event.NODE_DIED, Event.WATCHDOG_SUSPECT)

@@ -37,18 +37,19 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
 import msgspec
 
-from aftbed.core.errors import AftbedError
+from aftbed.core.errors import AftbedError, ConfigError
 from aftbed.core.graph import Graph
 from aftbed.ftm.compose import expressions
-from aftbed.judge.timeline import EVENT_LOG_NAME
+from aftbed.report.steering import ANSWER_CHARACTERS_MAX, COMMAND_S_MAX, child_command
+from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.unix import control_client, linux, run_directory
 from aftbed.runtime.unix.control_client import ProcessRow
-from aftbed.runtime.unix.run_directory import BUS_NAME
+from aftbed.runtime.unix.run_directory import BUS_NAME, EVENT_LOG_NAME
 from aftbed.runtime.unix.transport import Line
 from aftbed.vehicle.can.bus_load import load_percent, logged_frame
 from aftbed.vehicle.can.hub import user_behind
@@ -63,15 +64,12 @@ LAST_S_MAX: Final = 0.2  # that the pages may take to read the end
 END_S_MAX: Final = 0.9  # from the end of the run to that of the server
 CONNECTIONS_MAX: Final = 16
 COMMANDS_MAX: Final = 2  # at once
-COMMAND_S_MAX: Final = 20.0
 COMMAND_BYTES_MAX: Final = 1000
-ANSWER_CHARACTERS_MAX: Final = 4000
 SEND_S_MAX: Final = 5.0  # that a browser may take to read, or to send its request
 EVENTS_KEPT: Final = 500
 READ_BYTES_MAX: Final = 1_000_000  # of a log, at once
 NICE: Final = 10
 TOKEN_VARIABLE: Final = "AFTBED_PAGE_TOKEN"  # not an argument: other users can read those
-COMMANDS: Final = ("adapt", "inject", "stop")  # what the page may ask for
 POLICY: Final = (
     "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; connect-src 'self';"
     " img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -84,7 +82,8 @@ class Snapshot(msgspec.Struct, frozen=True):
     `status` is that of `aftbed status --json`; `nodes` has the nodes of the graph with their bricks, dead
     ones too, `processes` those that live. `events` are those since the last snapshot. `frames_s` and
     `load_percent` (with stuffing at its worst, see `bus_load`) are of the bus, by its time; None without one.
-    `silent_s`: for how long the run has not answered; all else is then as before.
+    `blackout_ms`: of the last adaptation. `silent_s`: for how long the run has not answered; all else is then
+    as before.
     """
 
     status: dict[str, object]
@@ -92,6 +91,7 @@ class Snapshot(msgspec.Struct, frozen=True):
     processes: list[ProcessRow]
     frames_s: float | None
     load_percent: float | None
+    blackout_ms: float | None
     events: list[dict[str, object]]
     silent_s: float = 0.0
 
@@ -204,6 +204,14 @@ class RunConnection:
         time.sleep(PERIOD_S)
 
 
+class Looked(NamedTuple):
+    """What a snapshot has of the graph: its nodes, the processes of those that live, the last blackout."""
+
+    nodes: dict[str, tuple[str, ...]]
+    processes: list[ProcessRow]
+    blackout_ms: float | None
+
+
 class RunWatcher:
     """Looks at the run for all pages at once."""
 
@@ -227,7 +235,7 @@ class RunWatcher:
                 self._run.await_start()
             record = Path(str(self._run.ask(control_client.StatusQuery())["record"]))
             events, bus = GrowingFile(record / EVENT_LOG_NAME), BusMeter(record / BUS_NAME)
-            nodes, processes = dict[str, tuple[str, ...]](), list[ProcessRow]()
+            graph = Looked({}, [], None)
             looked_s = changed_s = -math.inf
             while True:
                 if self._pages:
@@ -236,10 +244,11 @@ class RunWatcher:
                     if lines:
                         changed_s = now_s
                     if now_s - changed_s < LOOK_S or now_s - looked_s >= LOOK_S:
-                        nodes, processes = self._look()
-                        looked_s = now_s
+                        graph, looked_s = self._look(), now_s
                     bus.read(status.get("bitrate_bps"))
-                    self._tell(Snapshot(status, nodes, processes, bus.frames_s, bus.load_percent, []), lines)
+                    self._tell(
+                        Snapshot(status, *graph[:2], bus.frames_s, bus.load_percent, graph[2], []), lines
+                    )
                 with self._changed:
                     if not self._pages:
                         self._changed.wait(IDLE_S)
@@ -252,11 +261,12 @@ class RunWatcher:
         finally:
             self._run.close()
 
-    def _look(self) -> tuple[dict[str, tuple[str, ...]], list[ProcessRow]]:
-        """The nodes of the graph, and the processes of those that live."""
+    def _look(self) -> Looked:
         graph = msgspec.convert(self._run.ask(control_client.GraphQuery()), Graph)
         rows = control_client.process_rows(self._run.ask(control_client.ProcessesQuery()))
-        return graph.nodes, [row for row in rows if row.node]
+        ended = self._run.ask(control_client.AdaptationsQuery())["adaptations"]
+        blackouts = [one.blackout_ms for one in msgspec.convert(ended, list[Outcome])]
+        return Looked(graph.nodes, [row for row in rows if row.node], blackouts[-1] if blackouts else None)
 
     def _tell(self, snapshot: Snapshot, lines: Sequence[bytes] = ()) -> None:
         with self._changed:
@@ -427,17 +437,16 @@ class PageRequest(BaseHTTPRequestHandler):
 def carry_out(words: str, private: Path, at_once: threading.Semaphore) -> tuple[int, str]:
     """The exit code and the output of `aftbed WORDS` for this run, as at a second terminal."""
     try:
-        first, *others = shlex.split(words) or [""]
+        command = child_command(shlex.split(words), private)
     except ValueError:
         return 2, f"{words}: quotation marks come in pairs"
-    if first not in COMMANDS:
-        return 2, f"{first or 'nothing'}: {', '.join(COMMANDS)} are allowed here"
+    except ConfigError as error:
+        return 2, str(error)
     if not at_once.acquire(blocking=False):
         return 2, f"{COMMANDS_MAX} commands are under way: wait for one of them"
     try:
-        command = [sys.executable, "-m", "aftbed.cli.child", str(os.getpid()), first, *others]
         done = subprocess.run(
-            [*command, "--run", private.name],
+            command,
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,

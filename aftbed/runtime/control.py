@@ -307,10 +307,47 @@ BUS_REPORTS: Final = (
 
 
 class Report(msgspec.Struct, frozen=True, tag=True):
-    """A service to the executive; `data` depends on `kind`."""
+    """A service to the executive, or the executive to the command; `data` depends on `kind`."""
 
     kind: str
     data: bytes
+
+
+# Kinds of reports to the command, besides `trouble`.
+TELEMETRY: Final = "telemetry"  # a Telemetry of the vehicle
+SIGHT: Final = "sight"  # a Sight of a replay
+STATE: Final = "state"  # a ServiceState, when it is another one
+EVENT: Final = "event"  # a line of the log, as JSON
+FINISHED: Final = "finished"  # the last one: how it ended, as JSON
+
+
+class RequestCounts(msgspec.Struct, frozen=True):
+    """Requests that the Client has sent, and those of them that are answered."""
+
+    sent: int
+    answered: int
+
+
+class ServiceState(msgspec.Struct, frozen=True):
+    """What serves now; `leader` and `backup` are "" where there is none.
+
+    `cycle_us`, from request to reply, and `requests` are the latest that are known.
+    """
+
+    ftm: str
+    adapting: bool
+    leader: str
+    backup: str
+    epoch: int
+    cycle_us: float | None
+    requests: RequestCounts | None
+
+    @property
+    def roles(self) -> str:
+        """In words."""
+        leads = f"{self.leader} leads" if self.leader else "no leader"
+        backs_up = f"{self.backup} backs up" if self.backup else "no backup"
+        return f"{leads}, {backs_up}, epoch {self.epoch}"
 
 
 ToNode = (

@@ -140,9 +140,9 @@ class Load(Device):
         return self._client.next_id > self._count and not self._client.unanswered
 
     def stats(self) -> bytes:
-        waiting = len(self._client.unanswered)
+        sent, waiting = self._client.next_id - 1, len(self._client.unanswered)
         return msgspec.msgpack.encode(
-            {"sent": self._client.next_id - 1, "unanswered": waiting, "done": self.done}
+            {"sent": sent, "answered": sent - waiting, "unanswered": waiting, "done": self.done}
         )
 
 
@@ -235,9 +235,11 @@ class CarDevice(Device):
         return not self._payloads and not self._client.unanswered
 
     def stats(self) -> bytes:
+        sent, waiting = self._client.next_id - 1, len(self._client.unanswered)
         counts: dict[str, object] = {
-            "sent": self._client.next_id - 1,
-            "unanswered": len(self._client.unanswered) + len(self._payloads),
+            "sent": sent,
+            "answered": sent - waiting,
+            "unanswered": waiting + len(self._payloads),  # with those that wait to be sent
             "overrun": self._overrun,
             "cycle_us": self._cycle_us,
         }

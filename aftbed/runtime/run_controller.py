@@ -146,12 +146,23 @@ class RunController:
         if not self.ending:
             self._runtime.pool.refill(LIGHT, self.spares())
 
+    def state(self, cycle_us: float | None, requests: control.RequestCounts | None) -> control.ServiceState:
+        """What serves now; what the client has counted is given."""
+        deployment = self.deployment
+        return control.ServiceState(
+            ftm=deployment.graph.ftm,
+            adapting=self.adaptations.busy,
+            leader=deployment.leader,
+            backup=deployment.backup,
+            epoch=deployment.epoch,
+            cycle_us=cycle_us,
+            requests=requests,
+        )
+
     def inform_recovery(self, *, failed: bool) -> None:
         """Send it the situation; it may act again."""
         deployment = self.deployment
-        leads = f"{deployment.leader} leads" if deployment.leader else "no leader"
-        backs_up = f"{deployment.backup} backs up" if deployment.backup else "no backup"
-        self._runtime.log("roles", f"{leads}, {backs_up}, epoch {deployment.epoch}")
+        self._runtime.log("roles", self.state(None, None).roles)
         if self.executor.busy or not deployment.lives("recovery") or self.ending:
             return
         situation = self.executor.situation(failed=failed)

@@ -45,7 +45,7 @@ import msgspec
 from msgspec.structs import replace
 
 from aftbed.core.errors import ConfigError
-from aftbed.core.input_file import read_input
+from aftbed.core.yaml_file import read_yaml
 from aftbed.runtime.unix.worker_pool import each
 from aftbed.search.road_table import closing_speed_ms
 from aftbed.search.worst_instant import FINER_CYCLES, DriveCycle, coarse, span
@@ -67,7 +67,6 @@ from aftbed.vehicle.scenarios.scenario import broken_expectations
 
 FTTI_MAX_MS: Final = 2000
 JUDGES: Final = ("r152", "ncap")
-FHTI_BYTES_MAX: Final = 1_000_000
 NS_PER_MS: Final = 1_000_000
 
 
@@ -316,12 +315,10 @@ def margins(row: FttiRow, figures: Mapping[str, Fhti]) -> FttiRow:
 def read_fhti(path: Path) -> dict[str, Fhti]:
     """`{"MECHANISM": {"p50": ms, "p99": ms, "bound": ms or null}}`. Raises ConfigError."""
     try:
-        found = msgspec.json.decode(read_input(path, FHTI_BYTES_MAX), type=dict[str, Fhti])
-    except OSError as error:
-        raise ConfigError(f"--fhti {path}: {error.strerror}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        found = read_yaml(path, dict[str, Fhti])  # JSON is YAML
+    except ConfigError as error:
         form = '{"pbr": {"p50": 1.9, "p99": 3.6, "bound": 12.5}}'
-        raise ConfigError(f"--fhti {path}: {error}; allowed is a JSON object such as {form}") from None
+        raise ConfigError(f"--fhti {error}; allowed is a JSON object such as {form}") from None
     for name, fhti in found.items():
         bound_ms = fhti.p99 if fhti.bound is None else fhti.bound
         if not 0.0 <= fhti.p50 <= fhti.p99 <= bound_ms:

@@ -179,7 +179,7 @@ def repeat(setup: Setup) -> tuple[str, ...]:
     if not setup.faults:
         return f"aftbed sim {asked}", f"aftbed run {asked} --pace max"
     fault = setup.faults[0]
-    simulated = f'aftbed sim {asked} --faults "{fault}"'
+    simulated = f'aftbed sim {asked} --inject "{fault}"'
     if fault.trigger.after_ms:
         return (simulated,)
     pace = "real" if fault.action.takes_real_time else "max"

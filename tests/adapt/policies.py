@@ -6,7 +6,7 @@ from typing import Final
 from hypothesis import strategies as st
 
 from aftbed.adapt.policy import NS_PER_S, Action, Beyond, Policy, PolicyFile, policy_from
-from aftbed.core.yaml_file import read_yaml
+from aftbed.core.yaml_file import in_file, read_yaml
 from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, SIMPLEX
 
 S: Final = NS_PER_S
@@ -25,7 +25,14 @@ def read(tmp_path: Path, *rules: str, dwell: str = "5") -> Policy:
     """The policy of a file with these rules."""
     path = tmp_path / "mine.yaml"
     path.write_text(f"dwell_s: {dwell}\nrules:\n" + "".join(f"  - {{{rule}}}\n" for rule in rules))
-    return policy_from(read_yaml(path, PolicyFile), str(path))
+    return policy_at(path)
+
+
+def policy_at(path: Path) -> Policy:
+    """The policy of a file."""
+    file = read_yaml(path, PolicyFile)
+    with in_file(path):
+        return policy_from(file)
 
 
 levels = st.integers(0, 8).map(float)

@@ -7,25 +7,22 @@ from typing import get_args
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from policies import ACTIONS, COMPOSE, DECOMPOSE, TO_LFR, TO_PBR, S, read
+from policies import ACTIONS, COMPOSE, DECOMPOSE, TO_LFR, TO_PBR, S, policy_at, read
 
 from aftbed.adapt.policy import (
     Action,
     Beyond,
     Burst,
     Condition,
-    PolicyFile,
     Quiet,
     Resource,
     Symptom,
     action,
     conflict,
-    policy_from,
     symptoms,
 )
 from aftbed.core.errors import ConfigError
 from aftbed.core.events import Event
-from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import EXPRESSIONS, parse
 
 # -- actions
@@ -173,7 +170,8 @@ def test_a_rule_is_read(tmp_path: Path, rule: str, when: Condition, words: str) 
 def test_a_condition_that_is_none_is_refused(tmp_path: Path, when: str, reason: str) -> None:
     with pytest.raises(ConfigError) as error:
         read(tmp_path, f"when: {{{when}}}, then: decompose")
-    assert re.match(f"{tmp_path}/mine.yaml: (line \\d+: )?{re.escape(reason)}", str(error.value)), error.value
+    place = f"{tmp_path}/mine.yaml: line \\d+, column \\d+: "
+    assert re.match(f"{place}{re.escape(reason)}", str(error.value)), error.value
 
 
 @pytest.mark.parametrize(
@@ -191,8 +189,8 @@ def test_a_file_that_is_no_policy_is_refused(tmp_path: Path, text: str, reason: 
     path = tmp_path / "mine.yaml"
     path.write_text(text)
     with pytest.raises(ConfigError) as error:
-        policy_from(read_yaml(path, PolicyFile), str(path))
-    assert re.match(f"{path}: (line \\d+: )?{re.escape(reason)}", str(error.value)), error.value
+        policy_at(path)
+    assert re.match(f"{path}: line \\d+, column \\d+: {re.escape(reason)}", str(error.value)), error.value
 
 
 # -- the words
@@ -221,4 +219,4 @@ def test_the_page_names_every_symptom_and_resource_and_its_policy_can_be_read(tm
     text = page.split("```yaml file=policy.yaml\n")[1].split("```")[0]
     path = tmp_path / "policy.yaml"
     path.write_text(text)
-    assert len(policy_from(read_yaml(path, PolicyFile), str(path)).rules) > 1
+    assert len(policy_at(path).rules) > 1

@@ -1,5 +1,6 @@
 """A script as a file: written and read back it is the same, and every mistake is named with its place."""
 
+from functools import partial
 from pathlib import Path
 from string import ascii_lowercase
 from typing import Final
@@ -37,7 +38,7 @@ from aftbed.core.script import (
     Transfer,
     Unbind,
 )
-from aftbed.core.yaml_file import read_yaml
+from aftbed.core.yaml_file import position, read_yaml
 from aftbed.ftm.compose import EXPRESSIONS
 from aftbed.ftm.registry import KINDS
 
@@ -210,15 +211,15 @@ def test_a_step_that_is_wrong(step: str, reason: str) -> None:
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("purpose: x\n", "x.yaml: line 1: key 'commit' is missing"),
-        ("commit: []\n", "x.yaml: line 1: key 'purpose' is missing"),
-        ("purpose: x\ncommit: []\nprepair: []\n", "x.yaml: line 3: unknown key 'prepair'; did you mean"),
-        ("purpose: x\ncommit: a/x\n", "x.yaml: line 2: commit: found 'a/x', allowed is a list"),
-        ("purpose: x\ncommit: []\nrecipe: papr\n", "x.yaml: line 3: recipe: found 'papr', allowed is one of"),
-        ("purpose: ''\ncommit: []\n", "x.yaml: line 1: purpose: found ''"),
-        ("purpose: x\ncommit: []\ncommit: []\n", "x.yaml: line 3: key 'commit' stands twice"),
-        ("purpose: x\ncommit: []\nftm: lfrr\n", "x.yaml: ftm: unknown FTM 'lfrr'; did you mean 'lfr'?"),
-        ("purpose: x\ncommit: []\nftm: tr+pbr\n", "x.yaml: ftm: tr+pbr: "),
+        ("purpose: x\n", "x.yaml: line 1, column 1: key 'commit' is missing"),
+        ("commit: []\n", "x.yaml: line 1, column 1: key 'purpose' is missing"),
+        ("purpose: x\ncommit: []\nprepair: []\n", "x.yaml: line 3, column 1: unknown key 'prepair'; did"),
+        ("purpose: x\ncommit: a/x\n", "x.yaml: line 2, column 9: commit: found 'a/x', allowed"),
+        ("purpose: x\ncommit: []\nrecipe: papr\n", "x.yaml: line 3, column 9: recipe: found 'papr'"),
+        ("purpose: ''\ncommit: []\n", "x.yaml: line 1, column 10: purpose: found ''"),
+        ("purpose: x\ncommit: []\ncommit: []\n", "x.yaml: line 3, column 1: key 'commit' stands twice"),
+        ("purpose: x\ncommit: []\nftm: lfrr\n", "x.yaml: line 3, column 6: ftm: unknown FTM 'lfrr'; did you"),
+        ("purpose: x\ncommit: []\nftm: tr+pbr\n", "x.yaml: line 3, column 6: ftm: tr+pbr: "),
     ],
 )  # fmt: skip
 def test_a_key_that_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, reason: str) -> None:
@@ -226,7 +227,7 @@ def test_a_key_that_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, te
     path = Path("x.yaml")
     path.write_text(text)
     with pytest.raises(ConfigError) as error:
-        script_from(read_yaml(path, ScriptFile), str(path))
+        script_from(read_yaml(path, ScriptFile), str(path), partial(position, path))
     assert str(error.value).startswith(reason), error.value
 
 

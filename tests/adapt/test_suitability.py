@@ -17,6 +17,7 @@ from aftbed.adapt.suitability import (
     Limits,
     Resources,
     Row,
+    SuitabilityTable,
     TableFile,
     consistent,
     demand,
@@ -30,7 +31,7 @@ from aftbed.core import messages
 from aftbed.core.application import EXACT, NONE, Characteristics, approximate
 from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Checkpoint, Notification, Request
-from aftbed.core.yaml_file import read_yaml
+from aftbed.core.yaml_file import in_file, read_yaml
 from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, parse
 from aftbed.ftm.registry import MECHANISMS
 from aftbed.vehicle.aeb.function import default_application, sample_requests
@@ -321,10 +322,16 @@ limits: {low_cpu_load_max: 0.2}
 """
 
 
+def read_table(path: Path) -> SuitabilityTable:
+    file = read_yaml(path, TableFile)
+    with in_file(path):
+        return table_from(file)
+
+
 def test_a_users_table_lies_over_the_shipped_one(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(MINE)
-    table = table_from(read_yaml(path, TableFile), str(path))
+    table = read_table(path)
     assert table.limits == Limits(low_cpu_load_max=0.2)
     assert table.rows["pbr"] == TABLE.rows["pbr"]
     assert problems("lfr", CRASH, NEITHER, Resources(3, 0.1, 0), table) == []
@@ -352,12 +359,12 @@ def test_a_table_that_is_none_is_refused(tmp_path: Path, text: str, reason: str)
     path = tmp_path / "mine.yaml"
     path.write_text(text)
     with pytest.raises(ConfigError) as error:
-        table_from(read_yaml(path, TableFile), str(path))
-    assert re.match(f"{path}: (line \\d+: )?{re.escape(reason)}", str(error.value)), error.value
+        read_table(path)
+    assert re.match(f"{path}: line \\d+, column \\d+: {re.escape(reason)}", str(error.value)), error.value
 
 
 def test_a_table_is_data() -> None:
     file = TableFile(tuple(TABLE.rows.values()), TABLE.limits)
     assert msgspec.convert(msgspec.to_builtins(file), TableFile) == file
-    assert table_from(file, "itself") == TABLE
+    assert table_from(file) == TABLE
     assert isinstance(file.rows[0], Row)

@@ -80,5 +80,5 @@ def test_a_command_repeats_an_experiment(tmp_path: Path) -> None:
     experiment = next(planned(tmp_path).experiments())
     fault = experiment.faults[0]
     assert experiment.command() == (
-        f"aftbed sim --ftm pbr --placement process --seed {experiment.seed} --count 30 --faults '{fault}'"
+        f"aftbed sim --ftm pbr --placement process --seed {experiment.seed} --count 30 --inject '{fault}'"
     )

@@ -23,7 +23,7 @@ def refusal(folder: Path, text: str) -> str:
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("seed: 3", "sed: 3", r"try.yaml: line 3: unknown key 'sed'; did you mean 'seed'\?"),
+        ("seed: 3", "sed: 3", r"try.yaml: line 3, column 1: unknown key 'sed'; did you mean 'seed'\?"),
         (
             "seed: 3",
             'verifies: [SG-1, "SG 2"]',
@@ -33,7 +33,7 @@ def refusal(folder: Path, text: str) -> str:
         (
             "seed: 3",
             "sometimes: [fail over]",
-            r"sometimes: unknown name 'fail over'; did you mean 'failover'",
+            r"sometimes\[\d\]: unknown name 'fail over'; did you mean 'failover'",
         ),
         (
             "seed: 3",
@@ -41,11 +41,19 @@ def refusal(folder: Path, text: str) -> str:
             r"sometimes: fallback of the brakes: no experiment has a car: add system.scenario",
         ),
         ("seed: 3", "verifies: [SG-1, SG-1]", r"verifies\[1\]: SG-1 stands twice"),
-        ("seed: 3", "seed: -1", r"line 3: seed: found -1, allowed is a whole number at least 0"),
-        ("requests: 30", "requests: 30 Hz", r"line 4: system.requests: found '30 Hz', allowed is a whole"),
-        ("runtime: sim", "runtime: ros", r"line 4: system.runtime: found 'ros', allowed is one of"),
-        ("[pbr, lfr, none]", "[pbr, lfx]", r"mechanisms: unknown name 'lfx'; did you mean 'lfr'"),
-        ("[pbr, lfr, none]", "[]", r"line 5: mechanisms: found \[\], allowed is a list"),
+        ("seed: 3", "seed: -1", r"line 3, column \d+: seed: found -1, allowed is a whole number at least 0"),
+        (
+            "requests: 30",
+            "requests: 30 Hz",
+            r"line 4, column \d+: system.requests: found '30 Hz', allowed",
+        ),
+        (
+            "runtime: sim",
+            "runtime: ros",
+            r"line 4, column \d+: system.runtime: found 'ros', allowed",
+        ),
+        ("[pbr, lfr, none]", "[pbr, lfx]", r"mechanisms\[\d\]: unknown name 'lfx'; did you mean 'lfr'"),
+        ("[pbr, lfr, none]", "[]", r"line 5, column \d+: mechanisms: found \[\], allowed is a list"),
         (
             "crash primary at {event} nth {nth}",
             "bitflip memory at {event} nth {nth}",
@@ -68,9 +76,9 @@ def refusal(folder: Path, text: str) -> str:
         (
             "[tolerated]",
             "[tolerable]",
-            r"faults\[0\].expect.\*: unknown name 'tolerable'; did you mean 'tolerated'",
+            r"faults\[0\].expect.\*\[0\]: unknown name 'tolerable'; did you mean 'tolerated'",
         ),
-        ("name: nothing", "name: crash", r"faults: 'crash' stands twice"),
+        ("name: nothing", "name: crash", r"faults\[1\].name: 'crash' stands twice"),
         (
             "stop: {experiments: 4}",
             "stop: {experiments: 0}",
@@ -88,8 +96,8 @@ def refusal(folder: Path, text: str) -> str:
             r"leave_out\[0\]: unknown stratum 'pbr · crsh'; did you mean 'pbr · crash'",
         ),
         ("stop: {experiments: 4}", "leave_out: ['*']", r"leave_out: it leaves no stratum in"),
-        ("campaign: try", "campaign: [", r"try.yaml: line \d+: "),
-        ("seed: 3", "seed: 3\nseed: 4", r"line 4: key 'seed' stands twice"),
+        ("campaign: try", "campaign: [", r"try.yaml: line \d+, column \d+: "),
+        ("seed: 3", "seed: 3\nseed: 4", r"line 4, column \d+: key 'seed' stands twice"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, old: str, new: str, said: str) -> None:
@@ -140,9 +148,8 @@ def test_files_are_looked_up_beside_the_campaign_and_then_here(
         (CRASHES.replace("system: {", "system: {app: my.py:Sum, "), "app", "my.py"),
     ):
         found = refusal(beside, text)
-        told = (
-            f"try.yaml: system.{key}: .*/beside/{name}: no such file, beside the campaign file or in {here}$"
-        )
+        where = rf"try.yaml: line 4, column \d+: system.{key}: .*/beside/{name}"
+        told = f"{where}: no such file, beside the campaign file or in {here}$"
         assert re.search(told, found), found
     for folder in (here, beside):  # what is beside the file comes first
         (folder / "roads").mkdir()

@@ -383,7 +383,8 @@ def test_all_mistakes_of_a_script_are_printed(fake: FakeRun, refused: Output, lf
     lfr.write_text(lfr.read_text().replace("drain:", "drane:").replace("align:", "allign:"))
     lines = refused("adapt", "script", lfr).splitlines()
     assert lines[0] == f"aftbed: error: {lfr}: 2 problems:"
-    assert [line.strip().partition(":")[0] for line in lines[1:]] == ["commit[1]", "commit[2]"]
+    places = [line.split(": ")[:2] for line in lines[1:]]
+    assert places == [["  line 20, column 3", "commit[1]"], ["  line 21, column 3", "commit[2]"]]
 
 
 def test_a_script_that_does_not_fit_the_running_graph(fake: FakeRun, refused: Output, lfr: Path) -> None:

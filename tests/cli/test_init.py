@@ -146,7 +146,7 @@ def test_the_map_fits_its_log(here: Path, output: Output) -> None:
 def test_the_policy_and_the_script_are_accepted_and_the_script_is_carried_out(here: Path) -> None:
     write_file("policy", "mine", None)
     write_file("script", "by-hand", None)
-    assert len(policy_from(read_yaml(Path("mine.yaml"), PolicyFile), "mine.yaml").rules) == 2
+    assert len(policy_from(read_yaml(Path("mine.yaml"), PolicyFile)).rules) == 2
     script = script_from(read_yaml(Path("by-hand.yaml"), ScriptFile), "by-hand.yaml")
     assert refusals(build("pbr", "process"), script) == []
     run, breaches = attempt(Setup("pbr", count=20, adaptations=(Scheduled(Goal(script=script), 5),)))

@@ -2,16 +2,18 @@
 
 import json
 import os
-import re
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from liveruns import SHORT, Command, Home, aftbed, until
+from liveruns import RUN_SECONDS_MAX, SHORT, SHOWN_BYTES, Command, Home, Started, aftbed, ended, until
+from terminal import Terminal
 
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix import control_client, run_directory
+from aftbed.runtime.unix.options import CarRun
 
 pytestmark = pytest.mark.process
 
@@ -61,9 +63,16 @@ def check_status() -> None:
     assert (status["ftm"], status["placement"]) == ("pbr", "process")
     assert (status["leader"], status["backup"], status["epoch"]) == ("a", "b", 1)
     assert status["vehicle"]["speed_ms"] > 0
-    text = output("status")
-    assert re.search(rf"^run +{run}$", text, re.MULTILINE)
-    assert re.search(r"^leader +a$", text, re.MULTILINE)
+    assert status["requests"]["sent"] >= status["requests"]["answered"] > 0
+    lines = {line[:10].strip(): line[11:] for line in reversed(output("status").splitlines())}
+    assert lines["run"].startswith(f"{run}, for ")
+    assert lines["mechanism"] == "pbr (process), 0 adaptations"
+    assert lines["roles"] == "a leads, b backs up, epoch 1"
+    assert lines["requests"].endswith(" us")
+    assert "80.0 km/h  no target" in lines["car"]
+    assert lines["bus"] == f"can0 at 127.0.0.1:{status['port']}, for clients of socketcand"
+    assert lines["record"] == status["record"]
+    assert "started: 16 nodes" in lines["events"]
 
 
 def check_ps() -> None:
@@ -200,6 +209,46 @@ def test_check_of_a_record_equals_the_first_verdict(home: Home, tmp_path: Path) 
     names = {path.name for path in record.iterdir()}
     assert {"run.json", "journal", "bus.log", "end.json", "events.jsonl"} <= names
     assert "verdict: pass" in aftbed("check", record).out
+
+
+def test_a_quiet_run_prints_its_verdict(home: Home, tmp_path: Path) -> None:
+    record = tmp_path / "record"
+    done = aftbed("run", "--scenario", SHORT, "--pace", "max", "--record", record, "--quiet")
+    assert (done.code, done.out, done.err) == (0, "verdict: pass\n", "")
+    assert aftbed("check", record, "--quiet").out == "verdict: pass\n"
+
+
+def test_a_run_is_steered_by_keys(home: Home) -> None:
+    """The whole way: on a terminal, by the command line's words, seen when it has happened."""
+
+    def command() -> int:
+        drive = ("--scenario", "free-drive", "--placement", "replica")
+        os.execv(sys.executable, [sys.executable, "-m", "aftbed", "run", *drive])
+
+    with Terminal(command, 100, 40) as terminal:
+        before = terminal.modes
+        terminal.until_shown("pbr  a leads, b backs up, epoch 1")
+        terminal.type("icrash primary\n")
+        terminal.until_shown("pbr  b leads, a backs up, epoch 2")
+        terminal.until(lambda: ": crash primary" in terminal.text, "the answer")
+        terminal.type("ato nothing\n")
+        terminal.until_shown("aftbed: error: ")
+        terminal.type("ato lfr\n")
+        terminal.until_shown("lfr  b leads, a backs up")
+        terminal.type("q")
+        assert terminal.code() == 0, terminal.raw[-SHOWN_BYTES:]
+        assert b"verdict: pass" in terminal.raw
+        assert terminal.modes == before
+
+
+def test_a_run_can_end_while_its_command_is_suspended(home: Home, tmp_path: Path) -> None:
+    """More is reported than fits, and nothing reads it; how it ended comes through."""
+    drive = CarRun("free-drive", None, "latch", duration_ms=20_000)
+    with Started(home, drive, ftm="none", placement="replica", record=tmp_path / "record") as run:
+        assert ended(run.launched.supervisor, RUN_SECONDS_MAX)
+        done = run.finish()
+    assert run.launched.end is not None
+    assert done.verdict.verdict == "pass", done.verdict.reasons
 
 
 def test_a_run_without_a_terminal_prints_lines(home: Home) -> None:

@@ -163,11 +163,11 @@ def test_a_proposal_that_is_not_whole_ends_with_1(folder: Path, call: Call) -> N
         (("check", "toyotta", "--dbc", "radar.dbc"), "unknown map 'toyotta'; did you mean 'toyota'? "),
         (
             ("check", "toyota", "--dbc", "radar.dbc"),
-            "toyota.yaml: tracks.messages.name: unknown message 'TRACK_A_0' (one of: EGO, FD_ELSEWHERE, ",
+            "toyota.yaml: line 18, column 20: tracks.messages.name: unknown message 'TRACK_A_0' (one",
         ),
         (
             ("check", "ars408-like", "--dbc", "esr-like"),
-            "ars408-like.yaml: ego.message: unknown message 'SpeedInformation'",
+            "ars408-like.yaml: line 9, column 12: ego.message: unknown message 'SpeedInformation'",
         ),
         (("check", "esr-like", "--log", "none.log"), "none.log: cannot be read: No such file"),
         (("check", "esr-like", "--log", "radar.dbc"), "radar.dbc: no frame in it, read as candump ("),
@@ -193,9 +193,9 @@ def test_a_replay_by_a_map_of_another_radar_is_refused_before_the_start(
     folder: Path, refused: Output
 ) -> None:
     found = refused("run", "--replay", "drive.log", "--dbc", "radar.dbc", "--map", "esr")
-    assert "esr.yaml: ego.message: unknown message 'Vehicle_Data'" in found
+    assert "esr.yaml: line 10, column 12: ego.message: unknown message 'Vehicle_Data'" in found
     found = refused("run", "--replay", "drive.log", "--dbc", "radar.dbc", "--map", "toyota-tss2")
-    assert "toyota-tss2.yaml: tracks.messages.name: unknown message 'TRACK_A_0'" in found
+    assert "toyota-tss2.yaml: line 18, column 20: tracks.messages.name: unknown message 'TRACK_A_0'" in found
 
 
 def test_a_file_is_overwritten_with_force(folder: Path, output: Output) -> None:

@@ -117,7 +117,7 @@ def test_options_that_do_not_go_together_start_nothing(
 
 
 def test_a_simulated_run_sends_the_requests_of_a_file(folder: Path, call: Call) -> None:
-    fault = ("--faults", "crash primary at server.exit nth 3")
+    fault = ("--inject", "crash primary at server.exit nth 3")
     code, out, err = call("sim", "--requests", "requests.csv", "--expect", "expected.csv", *fault)
     assert (code, err) == (0, "")
     assert f"pbr (process), seed 0, {COUNT} requests of {folder}/requests.csv; crash primary" in out
@@ -135,7 +135,7 @@ def test_a_reply_of_a_simulated_run_that_is_not_expected_fails_it(folder: Path, 
 
 
 def test_a_reply_that_never_came_is_no_pass(folder: Path, call: Call) -> None:
-    lost = ("--ftm", "none", "--faults", "crash primary at server.exit nth 3")
+    lost = ("--ftm", "none", "--inject", "crash primary at server.exit nth 3")
     code, out, _ = call("sim", "--requests", "requests.csv", "--expect", "expected.csv", *lost)
     assert code == 3
     assert f"expected_replies: no reply to {COUNT - 2} of {COUNT} requests, the first is request 3" in out

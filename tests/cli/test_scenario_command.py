@@ -77,7 +77,7 @@ def test_a_row_that_fails_is_exit_code_1_and_says_why(table: Call, tmp_path: Pat
     assert code == 1
     assert "none, crash primary at server.enter nth 100" in out.splitlines()
     assert "  ncap:ccrb-12m-6-50: impact at " in out
-    assert f'  repeat  aftbed sim --scenario ncap:ccrb-12m-6-50 --ftm none --seed 0 --faults "{fault}"' in out
+    assert f'  repeat  aftbed sim --scenario ncap:ccrb-12m-6-50 --ftm none --seed 0 --inject "{fault}"' in out
     assert "0 of 1 rows pass" in out
 
 
@@ -397,10 +397,13 @@ def test_the_ftti_of_a_scenario_with_the_margin_of_a_mechanism(call: Call, tmp_p
         (["ccrs-20", "--brake-policy", "lock"], "unknown brake policy 'lock'"),
         (["ccrs-21"], "unknown scenario 'ccrs-21'"),
         (["ccrs-20", "--plot", "ftti.png"], "--plot ftti.png"),
-        (["ccrs-20", "--fhti", "nowhere.json"], "--fhti nowhere.json: No such file or directory"),
+        (
+            ["ccrs-20", "--fhti", "nowhere.json"],
+            "--fhti nowhere.json: cannot be read: No such file or directory",
+        ),
         (
             ["ccrs-20", "--fhti", "list.json"],
-            "--fhti list.json: Expected `object`, got `array`; allowed is a JSON object",
+            "--fhti list.json: line 1, column 1: found [], allowed is keys and values; allowed",
         ),
         (
             ["ccrs-20", "--fhti", "odd.json"],

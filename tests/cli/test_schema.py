@@ -111,7 +111,7 @@ VALUES: Final = st.one_of(
     st.none(),
     st.booleans(),
     st.integers(-5, 70_000),
-    st.sampled_from([0.5, -0.25, 1e9]),
+    st.sampled_from([0.5, -0.25, 1e9 + 0.5]),
     st.just([]),
     st.just({}),
 ) | st.sampled_from(["", "x", "none", "sim", "f64", "TRACK"])

@@ -31,7 +31,7 @@ from aftbed.search.swarm import drawn
 pytestmark = pytest.mark.simulation
 
 UNREPEATABLE: Final = "aftbed.vehicle.aeb.variants:NonDeterministic"
-FLIP: Final = ("--ftm", "pbr", "--count", "10", "--faults", "bitflip result bit 60 nth 3")  # no TR: sdc
+FLIP: Final = ("--ftm", "pbr", "--count", "10", "--inject", "bitflip result bit 60 nth 3")  # no TR: sdc
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def sim(call: Call) -> Call:
 
 
 def test_one_run_is_printed_between_its_seeds(sim: Call) -> None:
-    code, out, err = sim("--seed", "7", "--count", "20", "--faults", "crash primary at server.exit nth 3")
+    code, out, err = sim("--seed", "7", "--count", "20", "--inject", "crash primary at server.exit nth 3")
     lines = out.splitlines()
     assert (code, err) == (0, "")
     assert lines[0] == lines[-1] == "seed 7"
@@ -69,7 +69,7 @@ def test_one_run_is_printed_between_its_seeds(sim: Call) -> None:
 
 
 def test_a_fault_that_is_handled_later_than_the_ftti_fails(sim: Call) -> None:
-    crash = ("--count", "20", "--faults", "crash primary at server.exit nth 3")
+    crash = ("--count", "20", "--inject", "crash primary at server.exit nth 3")
     code, out, _ = sim(*crash, "--ftti", "10ms")
     (line,) = [line for line in out.splitlines() if line.startswith("  handled    ")]
     assert code == 0 and re.search(
@@ -85,12 +85,12 @@ def test_a_fault_that_is_handled_later_than_the_ftti_fails(sim: Call) -> None:
 
 
 def test_without_a_request_behind_the_fault_an_ftti_is_not_known(sim: Call) -> None:
-    code, out, _ = sim("--count", "20", "--faults", "crash primary after 60ms", "--ftti", "10ms")
+    code, out, _ = sim("--count", "20", "--inject", "crash primary after 60ms", "--ftti", "10ms")
     assert code == 3 and "ftti: crash primary after 60ms: no request came after it" in out
 
 
 def test_the_same_seed_prints_the_same(sim: Call) -> None:
-    arguments = ("--seed", "3", "--count", "20", "--rate", "900", "--faults", "crash backup after 4ms")
+    arguments = ("--seed", "3", "--count", "20", "--rate", "900", "--inject", "crash backup after 4ms")
     first, second = (re.sub(r" in [0-9.]+ ms", "", sim(*arguments)[1]) for _ in range(2))
     assert first == second
 
@@ -128,7 +128,7 @@ def test_a_function_of_the_user_is_simulated_updated_and_judged(sim: Call, tmp_p
     for step in (1, 2):
         (tmp_path / f"adder{step}.py").write_text(OTHER_FUNCTION.replace("STEP", str(step)))
     update = ("--adapt", f"update app to {tmp_path}/adder2.py:Adder at request 20")
-    crash = ("--faults", "crash primary at server.exit nth 9")
+    crash = ("--inject", "crash primary at server.exit nth 9")
     code, out, _ = sim("--app", tmp_path / "adder1.py:Adder", "--count", "40", *update, *crash)
     assert code == 0, out
     assert f"seed 0, 40 requests; {tmp_path}/adder1.py:Adder; crash primary" in out
@@ -165,7 +165,7 @@ def test_a_crash_right_behind_the_commit_of_an_update(sim: Call, tmp_path: Path)
     update = ("--adapt", f"update app to {tmp_path}/adder2.py:Adder at request 10", "--may-fail")
     words = ("--app", tmp_path / "adder1.py:Adder", "--count", "30", "--rate", "300", *update)
     for role, ftm in (("primary", "pbr"), ("backup", "pbr+tr"), ("engine", "lfr")):
-        code, out, _ = sim(*words, "--ftm", ftm, "--faults", f"crash {role} at adapt.commit")
+        code, out, _ = sim(*words, "--ftm", ftm, "--inject", f"crash {role} at adapt.commit")
         assert code == 0 and f"crash {role} at adapt.commit nth 1: activated" in out, out
         assert "30 answered, 0 lost, 0 duplicated, 0 late, 0 wrong" in out
 
@@ -194,7 +194,7 @@ def test_replies_are_compared_within_what_the_function_declares(
 ) -> None:
     """Its state keeps seven digits."""
     (tmp_path / "rough.py").write_text(ROUGH.replace("ACCESS", access))
-    app, crash = f"{tmp_path}/rough.py:Mean", ("--faults", "crash primary at server.exit nth 9")
+    app, crash = f"{tmp_path}/rough.py:Mean", ("--inject", "crash primary at server.exit nth 9")
     document = json.loads(sim("--app", app, "--ftm", "pbr", "--count", "12", *crash, "--json")[1])
     assert document["verdict"] == found, document["breaches"]
     assert all(one.startswith("one_history (G3): request ") for one in document["breaches"])
@@ -277,7 +277,7 @@ for line in sys.stdin:
 def test_a_program_brakes_a_car(sim: Call, tmp_path: Path) -> None:
     (tmp_path / "brake.py").write_text(BRAKE)
     app = f"{sys.executable} -I -S {tmp_path}/brake.py"
-    crash = ("--faults", "crash primary when ttc < 1.5")
+    crash = ("--inject", "crash primary when ttc < 1.5")
     code, out, _ = sim("--app", app, "--ftm", "pbr", "--scenario", "ccrs-20", *crash)
     assert code == 0 and re.search(r"^  car +stopped", out, re.MULTILINE), out
     assert "  failover   to epoch 2" in out
@@ -287,18 +287,18 @@ def test_what_a_function_says_wrong_after_a_failover_is_found(sim: Call, tmp_pat
     forgetful = OTHER_FUNCTION.replace("STEP", "1").replace("self.sum = int(state)", "pass")
     (tmp_path / "adder.py").write_text(forgetful)
     app = ("--app", tmp_path / "adder.py:Adder")
-    code, out, _ = sim(*app, "--count", "12", "--faults", "crash primary at server.exit nth 9")
+    code, out, _ = sim(*app, "--count", "12", "--inject", "crash primary at server.exit nth 9")
     assert code == 1 and "one_history fail" in out
     again = next(line for line in out.splitlines() if line.startswith("  repeat "))
     assert f"--app {tmp_path}/adder.py:Adder" in again
 
 
-ROLLED_BACK: Final = ("--adapt", "to lfr at request 5", "--faults", "crash b/after at adapt.step.enter nth 7")
+ROLLED_BACK: Final = ("--adapt", "to lfr at request 5", "--inject", "crash b/after at adapt.step.enter nth 7")
 REFUSED: Final = ("--adapt", "to pbr at request 5", "--force")
 
 
 def test_a_node_that_is_never_prepared_is_told_with_the_deadline(sim: Call) -> None:
-    fault = ("--faults", "hang a/after' at adapt.step.exit nth 1")
+    fault = ("--inject", "hang a/after' at adapt.step.exit nth 1")
     code, out, _ = sim("--count", "40", "--rate", "50", "--adapt", "to lfr at request 5", *fault)
     assert code == 3 and "prepare: no answer within 0.5 s from a/after'\n" in out, out
 
@@ -322,14 +322,14 @@ def test_an_adaptation_that_was_not_done_is_inconclusive_unless_it_may_fail(
 
 
 def test_a_car_stops_short(sim: Call) -> None:
-    code, out, _ = sim("--scenario", "ccrs-20", "--faults", "crash primary at server.exit nth 40")
+    code, out, _ = sim("--scenario", "ccrs-20", "--inject", "crash primary at server.exit nth 40")
     assert code == 0
     assert re.search(r"^  car        stopped [0-9.]+ m short", out, re.MULTILINE)
     assert "vehicle pass" in out
 
 
 def test_a_fault_or_adaptation_that_never_happened_is_inconclusive(sim: Call) -> None:
-    fault = ("--count", "10", "--faults", "crash primary at server.exit nth 11")
+    fault = ("--count", "10", "--inject", "crash primary at server.exit nth 11")
     code, out, _ = sim(*fault)
     assert code == 3
     assert "never fired: crash primary at server.exit nth 11" in out and "verdict: inconclusive" in out
@@ -345,7 +345,7 @@ def test_a_fault_or_adaptation_that_never_happened_is_inconclusive(sim: Call) ->
 
 
 def test_a_service_is_unavailable_if_every_replica_was_struck(sim: Call) -> None:
-    code, out, _ = sim("--ftm", "none", "--count", "10", "--faults", "crash primary at server.exit nth 3")
+    code, out, _ = sim("--ftm", "none", "--count", "10", "--inject", "crash primary at server.exit nth 3")
     assert code == 0 and "outcome: unavailable" in out
 
 
@@ -371,7 +371,7 @@ def test_the_document_of_a_failure(sim: Call) -> None:
     assert code == 1
     assert (found["seed"], found["verdict"], found["outcome"]) == (5, "fail", "sdc")
     assert found["breaches"][0] == "one_history (G3): request 3: the reply is not the bare server's"
-    assert found["command"].startswith("aftbed sim --seed 5 --ftm pbr --count 10 --faults ")
+    assert found["command"].startswith("aftbed sim --seed 5 --ftm pbr --count 10 --inject ")
     assert "--count 1 " in found["shrunk"]
 
 
@@ -430,7 +430,7 @@ def test_what_an_engine_would_refuse_needs_force() -> None:
 
 def test_times_in_a_command_are_exact_and_some_setups_have_no_command() -> None:
     early = Setup(faults=(Fault(Crash(), "primary", Trigger(after_ms=0.125)),))
-    assert repeating(early).endswith('--faults "crash primary after 0.125ms"')
+    assert repeating(early).endswith('--inject "crash primary after 0.125ms"')
     assert repeating(replace(early, dooms=(Doom("a/server", 1),))) == ""
 
 
@@ -560,7 +560,9 @@ def test_a_disagreement_is_exit_code_1(
     sim: Call, monkeypatch: pytest.MonkeyPatch, why_not: tuple[str, ...], code: int
 ) -> None:
     one = Agreement("pbr process", {"masked": 1}, {"masked": 20}, FAST, None, why_not)
-    monkeypatch.setattr("aftbed.cli.sim.against", lambda records, seeds, trust: [one] if seeds == 3 else [])
+    monkeypatch.setattr(
+        "aftbed.cli.sim.against", lambda records, seeds, trust, show: [one] if seeds == 3 else []
+    )
     found, out, _ = sim("--against", str(Path("there")), "--seeds", "0..2", "--json")
     assert (found, json.loads(out)["agree"]) == (code, not why_not)
 
@@ -598,13 +600,13 @@ def test_a_disagreement_is_exit_code_1(
         (("--scenario", "ccrs-50", "--count", "5"), ("the car makes the requests", "--count")),
         (("--swarm", "--ftm", "pbr"), ("--swarm draws everything", "leave out --ftm")),
         (("--swarm", "--count", "3", "--force"), ("leave out --count, --force",)),
-        (("--faults", "crash a/servr"), ("unknown target 'a/servr'", "did you mean 'a/server'")),
-        (("--ftm", "none", "--faults", "crash backup"), ("unknown target 'backup'",)),
-        (("--faults", "crash zygote"), ("the simulator has no zygote",)),
-        (("--faults", "crash primary after 9999999s"), ("duration '9999999s'",)),
-        (("--faults", "crash primary at server.exitt"), ("did you mean 'server.exit'",)),
+        (("--inject", "crash a/servr"), ("unknown target 'a/servr'", "did you mean 'a/server'")),
+        (("--ftm", "none", "--inject", "crash backup"), ("unknown target 'backup'",)),
+        (("--inject", "crash zygote"), ("the simulator has no zygote",)),
+        (("--inject", "crash primary after 9999999s"), ("duration '9999999s'",)),
+        (("--inject", "crash primary at server.exitt"), ("did you mean 'server.exit'",)),
         (
-            ("--ftm", "none", "--faults", "crash primary at checkpoint.sent"),
+            ("--ftm", "none", "--inject", "crash primary at checkpoint.sent"),
             ("cannot trigger a fault under --ftm none",),
         ),
         (("--adapt", "to lfrr"), ("--adapt 'to lfrr'", "did you mean 'lfr'")),

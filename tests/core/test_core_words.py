@@ -37,7 +37,7 @@ def test_whole_durations_are_rounded(text: str, ms: int) -> None:
 
 Reads = Callable[[str, str], float]
 BAD: Final = (
-    *("", "5", "ms", "s", "5 ms", "5min", "5mss", "-5ms", "+5ms", "1e3ms", ".5s", "5.s", "0.0000001s"),
+    *("", "0", "ms", "s", "5 ms", "5min", "5mss", "-5ms", "+5ms", "1e3ms", ".5s", "5.s", "0.0000001s"),
     *("0ms", "0.0s", "3600.1s", "3600001ms", "3601s", "9" * 11 + "ms", "²s"),
 )
 
@@ -48,6 +48,11 @@ def test_what_is_no_duration_is_named_with_what_is_allowed(read: Reads, text: st
     allowed = "a positive number with its unit is allowed, as 50ms or 2s, up to 3600s"
     with pytest.raises(ConfigError, match=f"^{re.escape(f'after {text!r}: {allowed}')}$"):
         read("after", text)
+
+
+def test_a_number_without_a_unit_gets_both() -> None:
+    with pytest.raises(ConfigError, match=r"up to 3600s; did you mean 5ms or 5s\?$"):
+        milliseconds("after", "5")
 
 
 @pytest.mark.parametrize("text", ["0.4ms", "0.5ms", "0.0001s"])

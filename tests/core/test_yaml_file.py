@@ -7,8 +7,8 @@ from typing import Annotated
 import msgspec
 import pytest
 
-from aftbed.core.errors import ConfigError
-from aftbed.core.yaml_file import VALUES_MAX, YAML_BYTES_MAX, read_yaml
+from aftbed.core.errors import ConfigError, FileKeyError
+from aftbed.core.yaml_file import VALUES_MAX, YAML_BYTES_MAX, in_file, read_yaml
 
 
 class Wheel(msgspec.Struct, forbid_unknown_fields=True):
@@ -19,6 +19,7 @@ class Wheel(msgspec.Struct, forbid_unknown_fields=True):
 class Cart(msgspec.Struct, forbid_unknown_fields=True):
     name: str
     wheels: list[Wheel] = []
+    spares: dict[str, dict[str, Wheel]] = {}
 
 
 class Limits(msgspec.Struct):
@@ -57,29 +58,45 @@ def test_a_number_needs_no_point_before_its_exponent(tmp_path: Path, text: str) 
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("", "key 'name' is missing"),
-        ("# nothing\n", "key 'name' is missing"),
-        ("wheels: []\n", "line 1: key 'name' is missing"),
+        ("", "line 1, column 1: key 'name' is missing; the file is empty"),
+        ("# nothing\n", "line 1, column 1: key 'name' is missing; the file is empty"),
+        ("wheels: []\n", "line 1, column 1: key 'name' is missing"),
         (
             GOOD.replace("200", "20"),
-            "line 3: wheels[0].size_mm: found 20, allowed is a whole number at least 100",
+            "line 3, column 14: wheels[0].size_mm: found 20, allowed is a whole number at least 100",
         ),
-        (GOOD.replace("winter", "7"), "line 4: wheels[0].tyre: found 7, allowed is a text or nothing"),
-        (GOOD.replace("tyre", "tire"), "line 4: wheels[0]: unknown key 'tire'; did you mean 'tyre'?"),
-        (GOOD + "  - tyre: summer\n", "line 5: wheels[1]: key 'size_mm' is missing"),
-        (GOOD + "nome: y\n", "line 5: unknown key 'nome'; did you mean 'name'?"),
-        (GOOD + "name: y\n", "line 5: key 'name' stands twice"),
-        ("name: x\nwheels: 3\n", "line 2: wheels: found 3, allowed is a list"),
-        ("- 1\n", "line 1: found [1], allowed is keys and values: name, wheels"),
-        ("name: {\n", "line 2: expected the node content, but found '<stream end>'"),
+        (
+            GOOD.replace("winter", "7"),
+            "line 4, column 11: wheels[0].tyre: found 7, allowed is a text",
+        ),
+        (
+            GOOD.replace("tyre", "tire"),
+            "line 4, column 5: wheels[0]: unknown key 'tire'; did you mean 'tyre'",
+        ),
+        (GOOD + "  - tyre: summer\n", "line 5, column 5: wheels[1]: key 'size_mm' is missing"),
+        (GOOD + "nome: y\n", "line 5, column 1: unknown key 'nome'; did you mean 'name'?"),
+        (GOOD + "name: y\n", "line 5, column 1: key 'name' stands twice"),
+        ("name: x\nwheels: 3\n", "line 2, column 9: wheels: found 3, allowed is a list"),
+        (
+            GOOD + "spares:\n  shed: {old: {size_mm: 100}}\n  attic: {old: {size_mm: 1}}\n",
+            "line 7, column 26: spares.attic.old.size_mm: found 1, allowed is a whole number at least 100",
+        ),
+        ("- 1\n", "line 1, column 1: found [1], allowed is keys and values: name, wheels, spares"),
+        ("name: {\n", "line 2, column 1: not YAML here; look for a bracket that"),
         (
             "name: x\nwheels:\n  - &a {size_mm: 200}\n  - {<<: *a}\n",
-            "line 4: could not determine a constructor",
+            "line 4, column 6: a plain value is allowed",
         ),
-        ("&a name: x\n<<: *b\n", "line 2: found undefined alias 'b'"),
+        (
+            "&a name: x\n<<: *b\n",
+            "line 2, column 5: not YAML here; look for an alias",
+        ),
         (b"\xff\xfe\x00\xd8", "not YAML: "),
         ("[\n" * 5000, "not YAML: "),
-        ("name: !!python/object:os.system {}\n", "line 1: could not determine a constructor for the tag"),
+        (
+            "name: !!python/object:os.system {}\n",
+            "line 1, column 7: a plain value is allowed: a text, a number",
+        ),
         (b"x" * (YAML_BYTES_MAX + 1), f"cannot be read: {YAML_BYTES_MAX + 1} bytes, allowed are "),
         (LAUGHS, f"not YAML: more than {VALUES_MAX} values, by its aliases"),
         (LAUGHS.replace("- ", "- <<: ").replace("[ha]", "{k: ha}"), "not YAML: "),
@@ -90,6 +107,26 @@ def test_a_bad_file_is_refused_with_the_line_of_the_error(
     text: str | bytes, reason: str, tmp_path: Path
 ) -> None:
     assert refusal(tmp_path / "a.yaml", text).startswith(reason)
+
+
+@pytest.mark.parametrize(
+    ("key", "where"),
+    [
+        ("wheels[0].tyre", "line 4, column 11: "),
+        ("wheels[0].colour", "line 3, column 5: "),  # as much of it as is there
+        ("wheels[7].tyre", "line 3, column 3: "),
+        ("axles", "line 1, column 1: "),
+    ],
+)
+def test_what_is_found_wrong_later_gets_the_same_place(tmp_path: Path, key: str, where: str) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text(GOOD)
+    with pytest.raises(ConfigError) as refused, in_file(path):
+        raise FileKeyError(key, "worn")
+    assert str(refused.value) == f"{path}: {where}{key}: worn"
+    with pytest.raises(ConfigError) as refused, in_file(path):
+        raise ConfigError("worn")
+    assert str(refused.value) == f"{path}: worn"
 
 
 def test_a_file_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:

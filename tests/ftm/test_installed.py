@@ -8,6 +8,7 @@ import pytest
 from packages import install, install_new
 
 from aftbed.adapt.suitability import AMPLE, FaultModel, problems
+from aftbed.cli import main
 from aftbed.cli.completer import complete
 from aftbed.core import installed
 from aftbed.core.application import Characteristics
@@ -137,6 +138,18 @@ def test_a_package_that_cannot_be_used_is_named_with_what_to_do(site: Path, plac
     assert expressions() == EXPRESSIONS
     (why,) = compose.load_installed()
     assert reason in why
+
+
+def test_where_all_are_listed_a_package_that_cannot_be_used_is_a_note(
+    site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    install(site, "my-package", {"mine": "gone:X"})
+    monkeypatch.setattr(sys, "argv", ["aftbed", "ftm", "list"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    shown = capsys.readouterr()
+    assert ended.value.code == 0 and "pbr+assert" in shown.out and "mine" not in shown.out
+    assert shown.err.startswith("aftbed: note: FTM mine of the package my-package 0.1.0: gone:X: ")
 
 
 def test_the_name_of_one_of_ours_stays_ours(site: Path) -> None:

@@ -131,11 +131,11 @@ def test_the_suitability_table_has_it(project: Path) -> None:
 
 def test_faults_are_aimed_at_its_events(project: Path) -> None:
     load = ("--ftm", "pbr+limit", "--count", "100", "--rate", "500")
-    first = ("--faults", "crash backup at state.restored nth 2")
-    second = ("--faults", "crash primary at proceed.enter nth 80")
+    first = ("--inject", "crash backup at state.restored nth 2")
+    second = ("--inject", "crash primary at proceed.enter nth 80")
     found = json.loads(run(project, "sim", *load, *first, *second, "--json"))
     assert found["verdict"] == "pass" and len(found["failovers"]) == 1
-    refused = run(project, "sim", "--ftm", "limit", "--faults", "crash primary at vote.compared", code=2)
+    refused = run(project, "sim", "--ftm", "limit", "--inject", "crash primary at vote.compared", code=2)
     assert "cannot trigger a fault under --ftm limit" in refused
 
 

@@ -125,7 +125,8 @@ class Run:
         def log(event: str, text: str) -> None:
             self.said.append(f"{event}: {text}")
 
-        work = Workload(options, pool, loop, log, lambda reason: None, lambda kind, data: None)
+        ignored = lambda *_: None  # noqa: E731
+        work = Workload(options, pool, loop, log, ignored, ignored, ignored)
         self.deployment.runtime = UnixRuntime(options, loop, pool, work, log)
         self.faults = FaultController(self.deployment)  # type: ignore[arg-type]
 

@@ -11,11 +11,12 @@ from aftbed.core.graph import PLACEMENTS, Graph
 from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, build
 from aftbed.inject.channel import ChannelFault, Disturbance
 from aftbed.inject.crash import Crash
-from aftbed.inject.grammar import BIT_MAX, Bit, BitBurst, Bits, Byte, StuckBit, Trigger
+from aftbed.inject.grammar import BIT_MAX, Bit, BitBurst, BitPattern, Bits, Byte, StuckBit, Trigger
 from aftbed.inject.model import Fault, parse
 from aftbed.inject.slow import Slow
 from aftbed.inject.targets import OTHERS, SUPERVISOR, Roles, emitters_in, emitting_node
 from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
+from aftbed.vehicle.aeb.function import STATE_BYTES
 
 
 def waits_in(fault: Fault, graph: Graph, leader: str, backup: str) -> str | None:
@@ -212,7 +213,25 @@ def test_a_bit_of_the_leader_can_be_flipped_under_every_mechanism(ftm: str, plac
     for target in ("primary", "a", *(["b"] if ftm.startswith(DUPLEX) else [])):
         for place in EXECUTED:
             bitflip(place, target).check(graph)
-            bitflip(place, target, "server.exit", 100, BIT_MAX).check(graph)
+            bitflip(place, target, "server.exit", 100, 511).check(graph)
+
+
+@pytest.mark.parametrize(
+    ("place", "pattern", "most"),
+    [
+        (ValuePlace.RESULT, Bit(512), "bytes 0 to 63 at most, bits 0 to 511"),
+        (ValuePlace.LOG, StuckBit(512, 1), "bytes 0 to 63 at most, bits 0 to 511"),
+        (ValuePlace.REQUEST, Byte(1024), "bytes 0 to 1023 at most, bits 0 to 8191"),
+        (ValuePlace.STATE, BitBurst(2, 8 * STATE_BYTES - 1), f"bytes 0 to {STATE_BYTES - 1} at most"),
+    ],
+)
+def test_bits_that_the_brake_never_has_are_refused_at_once(
+    place: ValuePlace, pattern: BitPattern, most: str
+) -> None:
+    fault = Fault(ValueFlip(place, pattern), "primary", Trigger())
+    with pytest.raises(ConfigError, match=f"{pattern} of {place.value}: the brake's has {most}"):
+        fault.check(build("pbr", "process"))
+    fault.check(build("pbr", "process", application="mine:Function"))  # its sizes are known to it alone
 
 
 @pytest.mark.parametrize(

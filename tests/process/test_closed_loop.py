@@ -12,6 +12,7 @@ from typing import Final
 import pytest
 from liveruns import WAIT_SECONDS_MAX, Done, Home, aftbed
 from sampling import every
+from terminal import Terminal
 
 from aftbed.runtime.unix.closed_loop import AdaptationHistory, Proposed, read_proposals
 
@@ -106,21 +107,33 @@ def test_what_the_run_refuses_is_an_outcome(home: Home, tmp_path: Path) -> None:
     assert one.consistent_after_ms is None
 
 
-@pytest.mark.parametrize(("typed", "outcome"), [(b"y\n", "done"), (b"n\n", "declined")])
-def test_a_person_is_asked(home: Home, tmp_path: Path, typed: bytes, outcome: str) -> None:
-    ours, theirs = pty.openpty()
+def asking(tmp_path: Path) -> list[str]:
+    """A run that asks whether TR is to be composed; its record is in `tmp_path`."""
     path, record = policy(tmp_path, TWO_DIVERGENCES), tmp_path / "record"
     options = ["--ftm", "lfr", *LOAD, *DIVERGE, "--policy", str(path), "--record", str(record)]
-    command = [sys.executable, "-m", "aftbed", "run", *options, "--approve", "ask"]
+    return [sys.executable, "-m", "aftbed", "run", *options, "--approve", "ask"]
+
+
+def test_a_person_is_asked(home: Home, tmp_path: Path) -> None:
+    ours, theirs = pty.openpty()
     try:
-        with subprocess.Popen(command, stdin=theirs, stdout=subprocess.PIPE) as run:
+        with subprocess.Popen(asking(tmp_path), stdin=theirs, stdout=subprocess.PIPE) as run:
             assert run.stdout is not None
             while b"question: compose tr? y or n" not in (line := run.stdout.readline()):
                 assert line, "ended without a question"
-            os.write(ours, typed)
+            os.write(ours, b"y\n")
             rest = run.stdout.read().decode()
             assert run.wait(WAIT_SECONDS_MAX) == 0, rest
     finally:
         os.close(ours)
         os.close(theirs)
-    assert [p.outcome for p in read_proposals(record) or ()] == [outcome]
+    assert [p.outcome for p in read_proposals(tmp_path / "record") or ()] == ["done"]
+
+
+def test_a_person_is_asked_in_the_view(home: Home, tmp_path: Path) -> None:
+    words = asking(tmp_path)
+    with Terminal(lambda: os.execv(words[0], words), 100, 40) as terminal:
+        terminal.until_shown("compose tr? y or n")
+        terminal.type("n")
+        assert terminal.code() == 0, terminal.text
+    assert [p.outcome for p in read_proposals(tmp_path / "record") or ()] == ["declined"]

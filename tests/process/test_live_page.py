@@ -110,6 +110,7 @@ def test_it_shows_a_crash_and_a_composition_that_its_buttons_asked_for(home: Hom
             page.until("document.querySelector('[data-fact=mechanism]').textContent == 'pbr+tr'")
             page.until("document.getElementById('answer').textContent.includes('pbr to pbr+tr: done')")
             page.until("!!document.querySelector('[data-node=\"a/tr.after\"]')")
+            page.until("document.querySelector('[data-fact=\"last blackout\"]').textContent.endsWith(' ms')")
             for width, dark in ((1280, False), (420, True)):
                 page.look(tmp_path / f"page{width}.png", width, dark=dark)
                 assert page.value("document.documentElement.scrollWidth <= innerWidth"), width

@@ -367,7 +367,7 @@ def test_a_state_that_is_hit_in_a_backup_and_overwritten_was_never_used() -> Non
         ("crash primary at reply.sent nth 1000", "armed"),
         ("hang primary for 3ms at reply.sent nth 5", "activated"),
         ("hang primary at reply.sent nth 5", "activated"),  # found, and killed
-        ("bitflip result bit 100000 nth 5", "not_activated"),
+        ("bitflip result bit 500 nth 5", "not_activated"),
         ("bitflip state bit 0 nth 5", "not_activated"),  # no function takes a state of another version
         ("omission pxy2pro nth 1000", "armed"),
         ("slow primary after 1h", "armed"),

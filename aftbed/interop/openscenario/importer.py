@@ -22,13 +22,13 @@ against hostile XML would amount to refusing a DOCTYPE, which expat can do.
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
-from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.errors import ConfigError, FileKeyError, unknown
 from aftbed.interop.files import write_text_whole
 from aftbed.interop.openscenario.catalog import Catalogs
 from aftbed.interop.openscenario.document import (
@@ -265,13 +265,26 @@ def _read(
 ) -> tuple[ImportedDrive, tuple[IgnoredElement, ...]]:
     _read_version(root.one("FileHeader"))
     ego = _find_ego(root, options.ego)
-    with fitting(root):
+    with fitting(root) as take_in:
         set_aside(root, ego, catalogs, options.duration_s)
+        for entry in of_catalogs(root):
+            take_in(entry)
         refuse(root)
         cars, entries = read_cars(root, catalogs)
+        for entry in entries:
+            take_in(entry)
         drive = StoryboardReader(root, cars, ego, options.duration_s).read()
         check_road(root, empty=drive.lead is None)
         return drive, tuple(one for tree in (root, *entries) for one in account(tree))
+
+
+def of_catalogs(element: Element) -> Iterator[Element]:
+    """The entries of catalogs that were put into the tree."""
+    for child in element.children:
+        if child.path != element.path:
+            yield child
+        else:
+            yield from of_catalogs(child)
 
 
 def _find_ego(root: Element, asked: str | None) -> str:
@@ -322,7 +335,9 @@ def _scenario_file(name: str, drive: ImportedDrive, description: str, expect: st
     keys["road"] = {"friction": drive.friction}
     keys["expect"] = {"outcome": expect}
     try:
-        scenario_of(name, name, msgspec.convert(keys, ScenarioKeys))
+        scenario_of(name, msgspec.convert(keys, ScenarioKeys))
+    except FileKeyError as error:
+        raise ConfigError(f"{name}: {error}") from error
     except msgspec.ValidationError as error:
         reason = f"the scenario would be out of range: {error}"
         raise RefusedError(f"{path}: {reason}", str(path), 0, reason, Cause.RANGE) from error

@@ -1,8 +1,9 @@
 """The schema of OpenSCENARIO XML, as far as the importer reads it: attributes and children of each element.
 
 The tables below are written after ASAM's XSDs of the versions 1.0 to 1.3, which are not part of this package.
-They are those of 1.3, which allows what the older ones do. A row of `TYPES` is a type, its attributes and its
-content:
+They are those of 1.3, which allows what the older ones do. Two rules are looser, for files of esmini: a
+story, an act, a maneuver and a list of actions may be empty, and a step has no value. A row of `TYPES` is a
+type, its attributes and its content:
 
     Event [maximumExecutionCount?=count name priority=Priority] Action+ StartTrigger:Trigger?
 
@@ -33,7 +34,7 @@ from aftbed.interop.openscenario.document import (
 TYPES: Final = """\
 AbsoluteTargetSpeed [value=number]
 AccelerationCondition [rule=Rule value=number direction?=DirectionalDimension]
-Act [name] ManeuverGroup+ StartTrigger:Trigger? StopTrigger:Trigger?
+Act [name] ManeuverGroup* StartTrigger:Trigger? StopTrigger:Trigger?
 Action [name] GlobalAction | UserDefinedAction | PrivateAction
 Actors [selectTriggeringEntities=flag] EntityRef*
 AngleCondition [angleType=AngleType angle=number angleTolerance=number
@@ -84,7 +85,7 @@ LogNormalDistribution [expectedValue=number variance=number] Range?
 LongitudinalAction SpeedAction | LongitudinalDistanceAction | SpeedProfileAction
 LongitudinalDistanceAction [entityRef continuous=flag distance?=number freespace=flag timeGap?=number
     displacement?=LongitudinalDisplacement coordinateSystem?=CoordinateSystem] DynamicConstraints?
-Maneuver [name] Event+
+Maneuver [name] Event*
 ManeuverGroup [maximumExecutionCount=count name] Actors CatalogReference* Maneuver*
 MiscObject [mass=number miscObjectCategory=MiscObjectCategory name model3d?] BoundingBox & Properties?
 NormalDistribution [expectedValue=number variance=number] Range?
@@ -103,7 +104,7 @@ PoissonDistribution [expectedValue=number] Range?
 Position WorldPosition | RelativeWorldPosition | RelativeObjectPosition | RoadPosition |
     RelativeRoadPosition | LanePosition | RelativeLanePosition | RoutePosition | GeoPosition |
     TrajectoryPosition
-Private [entityRef] PrivateAction+
+Private [entityRef] PrivateAction*
 PrivateAction LongitudinalAction | LateralAction | VisibilityAction | SynchronizeAction |
     ActivateControllerAction | ControllerAction | TeleportAction | RoutingAction | AppearanceAction |
     TrailerAction
@@ -138,7 +139,7 @@ Stochastic [numberOfTestRuns=count randomSeed?=number] StochasticDistribution+
 StochasticDistribution [parameterName] (ProbabilityDistributionSet | NormalDistribution |
     LogNormalDistribution | UniformDistribution | PoissonDistribution | Histogram |
     UserDefinedDistribution)
-Story [name] Act+
+Story [name] Act*
 Storyboard Init Story* StopTrigger:Trigger?
 StoryboardElementStateCondition [storyboardElementRef state=StoryboardElementState
     storyboardElementType=StoryboardElementType]
@@ -213,15 +214,15 @@ class Child(NamedTuple):
     type: str
 
 
-class Sequence(NamedTuple):
+class InOrder(NamedTuple):
     items: "tuple[Content, ...]"
 
 
-class Choice(NamedTuple):
+class OneOf(NamedTuple):
     items: "tuple[Content, ...]"
 
 
-class All(NamedTuple):
+class AnyOrder(NamedTuple):
     """Each of them, in any order."""
 
     items: "tuple[Content, ...]"
@@ -233,8 +234,8 @@ class Repeated(NamedTuple):
     many: bool
 
 
-Content = Child | Sequence | Choice | All | Repeated
-NOTHING: Final = Sequence(())
+Content = Child | InOrder | OneOf | AnyOrder | Repeated
+NOTHING: Final = InOrder(())
 
 
 def may_end(content: Content) -> bool:
@@ -242,9 +243,9 @@ def may_end(content: Content) -> bool:
     match content:
         case Child(tag, _):
             return tag in IGNORED
-        case Sequence(items) | All(items):
+        case InOrder(items) | AnyOrder(items):
             return all(map(may_end, items))
-        case Choice(items):
+        case OneOf(items):
             return any(map(may_end, items))
         case Repeated(item, optional, _):
             return optional or may_end(item)
@@ -255,11 +256,11 @@ def next_tags(content: Content) -> list[str]:
     match content:
         case Child(tag, _):
             return [tag]
-        case Choice(items) | All(items):
+        case OneOf(items) | AnyOrder(items):
             return [tag for item in items for tag in next_tags(item)]
         case Repeated(item, _, _):
             return next_tags(item)
-        case Sequence(items):
+        case InOrder(items):
             found: list[str] = []
             for item in items:
                 found += next_tags(item)
@@ -273,20 +274,20 @@ def behind(content: Content, tag: str) -> Content | None:
     match content:
         case Child(own, _):
             return NOTHING if own == tag else None
-        case Choice(items):
+        case OneOf(items):
             return next((rest for item in items if (rest := behind(item, tag)) is not None), None)
         case Repeated(item, _, many):
             rest = behind(item, tag)
-            return None if rest is None else Sequence((rest, Repeated(item, True, many))) if many else rest
-        case All(items):
+            return None if rest is None else InOrder((rest, Repeated(item, True, many))) if many else rest
+        case AnyOrder(items):
             for place, item in enumerate(items):
                 if behind(item, tag) is not None:
-                    return All(items[:place] + items[place + 1 :])
+                    return AnyOrder(items[:place] + items[place + 1 :])
             return None
-        case Sequence(items):
+        case InOrder(items):
             for place, item in enumerate(items):
                 if (rest := behind(item, tag)) is not None:
-                    return Sequence((rest, *items[place + 1 :]))
+                    return InOrder((rest, *items[place + 1 :]))
                 if not may_end(item):
                     return None
             return None
@@ -299,7 +300,7 @@ def children(content: Content) -> Iterator[Child]:
             yield content
         case Repeated(item, _, _):
             yield from children(item)
-        case Sequence(items) | Choice(items) | All(items):
+        case InOrder(items) | OneOf(items) | AnyOrder(items):
             for item in items:
                 yield from children(item)
 
@@ -356,11 +357,11 @@ def _attribute(text: str) -> Attribute:
 def _content(tokens: list[str]) -> Content:
     """Reads `tokens` up to the end or a closing bracket, and takes them away."""
     items: list[Content] = []
-    kind: type[Sequence | Choice | All] = Sequence
+    kind: type[InOrder | OneOf | AnyOrder] = InOrder
     while tokens and tokens[0] != ")":
         token = tokens.pop(0)
         if token in "|&":
-            kind = Choice if token == "|" else All
+            kind = OneOf if token == "|" else AnyOrder
             continue
         item: Content
         if token == "(":
@@ -379,7 +380,7 @@ def _content(tokens: list[str]) -> Content:
 # -- the check
 
 
-class Misfit(NamedTuple):
+class Violation(NamedTuple):
     """What the schema does not allow; `lineage` ends with `element`."""
 
     element: Element
@@ -392,15 +393,15 @@ class Misfit(NamedTuple):
 
 
 @contextlib.contextmanager
-def fitting(root: Element) -> Iterator[None]:
-    """What is done with a whole file, or a distribution, under the schema.
+def fitting(root: Element) -> Iterator[Callable[[Element], None]]:
+    """What is done with a whole file, or a distribution; it gives what takes in entries of catalogs.
 
     Raises ConfigError with all that does not fit and is not ignored by then. That takes the place of the
     first mistake that the block has come upon, but of no other refusal.
     """
-    unfit = misfits(root, "OpenScenario")
+    unfit = violations(root, "OpenScenario")
     try:
-        yield
+        yield lambda entry: unfit.extend(violations(entry, entry.tag))
     except RefusedError as error:
         if error.cause is Cause.MISTAKE:
             _refuse(root, unfit)
@@ -408,34 +409,34 @@ def fitting(root: Element) -> Iterator[None]:
     _refuse(root, unfit)
 
 
-def misfits(root: Element, type_name: str) -> list[Misfit]:
+def violations(root: Element, type_name: str) -> list[Violation]:
     """What of a tree of this type the schema does not allow. A value with a parameter in it fits."""
-    return list(_misfits(root, type_name, ()))
+    return list(_violations(root, type_name, ()))
 
 
-def _refuse(root: Element, unfit: list[Misfit]) -> None:
+def _refuse(root: Element, unfit: list[Violation]) -> None:
     raise_refused(root, [(one.element, (Cause.MISTAKE, one.reason)) for one in unfit if one.matters])
 
 
-def _misfits(element: Element, type_name: str, above: tuple[Element, ...]) -> Iterator[Misfit]:
+def _violations(element: Element, type_name: str, above: tuple[Element, ...]) -> Iterator[Violation]:
     schema, lineage = types().get(type_name), (*above, element)
     if schema is None:
         return
-    yield from (Misfit(element, reason, lineage) for reason in _of_attributes(element, schema.attributes))
+    yield from (Violation(element, reason, lineage) for reason in _of_attributes(element, schema.attributes))
     rest = schema.content
     for child in element.children:
         after = behind(rest, child.tag)
         if after is None:
             allowed = [*next_tags(rest), *(["its end"] if may_end(rest) else [])]
             reason = f"not allowed here in {element.tag}, allowed is {' or '.join(allowed)}"
-            yield Misfit(child, reason, (*lineage, child))
+            yield Violation(child, reason, (*lineage, child))
         else:
             rest = after
         if child.tag in schema.types:
-            yield from _misfits(child, schema.types[child.tag], lineage)
+            yield from _violations(child, schema.types[child.tag], lineage)
     if not may_end(rest):
         there = ", ".join(child.tag for child in element.children[:5]) or "nothing"
-        yield Misfit(element, f"found {there}, allowed is {' or '.join(next_tags(rest))}", lineage)
+        yield Violation(element, f"found {there}, allowed is {' or '.join(next_tags(rest))}", lineage)
 
 
 def _of_attributes(element: Element, allowed: tuple[Attribute, ...]) -> Iterator[str]:

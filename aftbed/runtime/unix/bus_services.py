@@ -6,7 +6,7 @@ import select
 import socket
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -20,6 +20,10 @@ from aftbed.vehicle.can.hub import serve as serve_hub
 
 if TYPE_CHECKING:
     from aftbed.inject.bus_disturber import Disturber
+    from aftbed.vehicle.can.frame import Frame
+    from aftbed.vehicle.gateway import BusGateway
+
+SIGHT_MS: Final = 50  # between two reports of what the function sees, in bus time
 
 
 def preload() -> None:
@@ -203,12 +207,37 @@ def _drive(line: Line[control.ToNode], source: SourceOptions) -> None:
             codec,
             buses,
             options,
-            report=lambda telemetry: _report(line, "telemetry", msgspec.msgpack.encode(telemetry)),
+            report=lambda telemetry: _report(line, control.TELEMETRY, msgspec.msgpack.encode(telemetry)),
             stop=orders.stop,
             radar=orders.faults,
         )
         orders.end()
         _report(line, "result", msgspec.json.encode(result))
+
+
+class _ViewOfFunction:
+    """Reports what the function sees in a replay, for people: at most each SIGHT_MS of bus time."""
+
+    def __init__(self, line: Line[control.ToNode], gateway: "BusGateway") -> None:
+        self._line, self._gateway = line, gateway
+        self._request = b""  # of the last cycle
+        self._next_ms = 0
+
+    def ends_cycle(self, frame: "Frame") -> bool:
+        request = self._gateway.on_frame(frame)
+        if request is not None:
+            self._request = request
+        return request is not None
+
+    def answered(self, stage: int, deceleration_ms2: float) -> None:
+        from aftbed.vehicle.aeb.messages import decode_request, sight_of  # noqa: PLC0415
+
+        if not self._request:
+            return  # an answer to what was sent before
+        sight = sight_of(decode_request(self._request), stage, deceleration_ms2)
+        if sight.t_ms >= self._next_ms:
+            self._next_ms = sight.t_ms + SIGHT_MS
+            _report(self._line, control.SIGHT, msgspec.msgpack.encode(sight))
 
 
 def _play(line: Line[control.ToNode], source: SourceOptions, log: int) -> None:
@@ -225,15 +254,16 @@ def _play(line: Line[control.ToNode], source: SourceOptions, log: int) -> None:
     with open(log, "rb") as file:
         played = msgspec.msgpack.decode(file.read(), type=PlayedLog)
     bus = open_bus(BusOptions(port=source.port, secret=source.secret, node=PLAYER))
-    orders = _Orders(line)
+    orders, view = _Orders(line), _ViewOfFunction(line, gateway)
     if orders.until_go():
         result = play(
             played.frames,
             own_dbc(),
             bus,
             work.pace,
-            ends_cycle=lambda frame: gateway.on_frame(frame) is not None,
+            ends_cycle=view.ends_cycle,
             stop=orders.stop,
+            answered=view.answered,
             pause_us=bound.map.cycle_ms * 1000 if work.loop else None,
             until_us=work.duration_ms * 1000 if work.duration_ms is not None else None,
         )

@@ -240,7 +240,7 @@ def _record_undo(record: Path, started_ns: int, text: str) -> None:
     line = json.dumps({"t_ms": t_ms, "event": "undone", "text": f"by the warden: {text}"})
     with (
         contextlib.suppress(OSError),  # the undo counts, not its record
-        open(record / "events.jsonl", "ab", buffering=0) as file,
+        open(record / run_directory.EVENT_LOG_NAME, "ab", buffering=0) as file,
     ):
         file.write(line.encode() + b"\n")
 

@@ -26,11 +26,10 @@ the newest `INCARNATIONS` journals are read.
 
 import contextlib
 import os
-import select
 import sys
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, Literal
 
@@ -55,13 +54,13 @@ from aftbed.adapt.policy import (
 from aftbed.adapt.suitability import unsuitable
 from aftbed.core import journal
 from aftbed.core.application import Characteristics
-from aftbed.core.errors import AftbedError, ConfigError, PeerError, unknown
+from aftbed.core.errors import AftbedError, ConfigError, FileKeyError, PeerError, unknown
 from aftbed.core.input_file import read_input
 from aftbed.core.journal import Record
 from aftbed.core.messages import Goal
 from aftbed.ftm.compose import NONE
 from aftbed.runtime.adaptations import Outcome
-from aftbed.runtime.unix import control_client
+from aftbed.runtime.unix import control_client, linux
 from aftbed.runtime.unix.control_client import Answer
 from aftbed.runtime.unix.options import RunOptions
 from aftbed.runtime.unix.run_directory import HISTORY_NAME
@@ -136,7 +135,7 @@ def policy_names() -> list[str]:
 
 def load_policy(name_or_path: str) -> Policy:
     """A shipped policy by name, or a file by path: whatever has a slash or ends in .yaml or .yml."""
-    from aftbed.core.yaml_file import read_yaml  # noqa: PLC0415 - PyYAML costs 15 ms
+    from aftbed.core.yaml_file import in_file, read_yaml  # noqa: PLC0415 - PyYAML costs 15 ms
 
     if "/" in name_or_path or name_or_path.endswith((".yaml", ".yml")):
         path = Path(name_or_path)
@@ -144,13 +143,15 @@ def load_policy(name_or_path: str) -> Policy:
         path = _FOLDER / f"{name_or_path}.yaml"
     else:
         raise unknown("policy", name_or_path, policy_names())
-    policy = policy_from(read_yaml(path, PolicyFile), str(path))
-    for rule in policy.rules:
-        if isinstance(rule.when, Beyond) and rule.when.resource not in MEASURED:
-            raise ConfigError(
-                f"{path}: {rule.key}.when.resource: found {rule.when.resource}, which no run measures;"
-                f" measured are: {', '.join(MEASURED)}"
-            )
+    file = read_yaml(path, PolicyFile)
+    with in_file(path):
+        policy = policy_from(file)
+        for rule in policy.rules:
+            if isinstance(rule.when, Beyond) and rule.when.resource not in MEASURED:
+                raise FileKeyError(
+                    f"{rule.key}.when.resource",
+                    f"found {rule.when.resource}, which no run measures; measured are: {', '.join(MEASURED)}",
+                )
     return policy
 
 
@@ -297,6 +298,7 @@ class ClosedLoop:
         self._proposed: Counter[str] = Counter()  # by rule
         self._trouble = ""
         self.show: Show = lambda _: None
+        self.reads_input = True  # answers are read here; else `decide` is called with them
         self._application = options.application
         self._clock_known = False  # an event has shown when the run's clock began
         self._input_ended = False
@@ -310,30 +312,22 @@ class ClosedLoop:
             return "free"
         return "asking" if self._line is None else "adapting"
 
-    def wait(self, descriptor: int) -> None:
-        """Observe until `descriptor` is readable."""
-        while True:
-            now_ns = time.monotonic_ns()
-            if now_ns >= self._due_ns:
-                self._due_ns = now_ns + round(PERIOD_SECONDS * 1e9)
-                self._observe(now_ns)
-            ready = self._ready(descriptor, max(0, self._due_ns - time.monotonic_ns()))
-            if self._line is not None and self._line.fileno() in ready:
-                self._take_answer(self._line)
-            if self.state == "asking" and sys.stdin.fileno() in ready:
-                self._take_decision()
-            if descriptor in ready:
-                return
-
-    def _ready(self, descriptor: int, wait_ns: int) -> set[int]:
-        """Wait until some descriptors can be read, at most that long."""
-        poll = select.poll()
-        poll.register(descriptor, select.POLLIN)
-        if self._line is not None:
-            poll.register(self._line.fileno(), select.POLLIN)
-        elif self.state == "asking":
-            poll.register(sys.stdin.fileno(), select.POLLIN)
-        return {fd for fd, _ in poll.poll(wait_ns / 1e6)}
+    def wait(self, descriptors: Sequence[int]) -> set[int]:
+        """Observe until one of `descriptors` is readable, or for a period; those that are."""
+        now_ns = time.monotonic_ns()
+        if now_ns >= self._due_ns:
+            self._due_ns = now_ns + round(PERIOD_SECONDS * 1e9)
+            self._observe(now_ns)
+        own = [self._line.fileno()] if self._line is not None else []
+        if self.state == "asking" and self.reads_input:
+            own.append(sys.stdin.fileno())
+        wait_s = max(0, self._due_ns - time.monotonic_ns()) / 1e9
+        ready = linux.readable((*descriptors, *own), wait_s)
+        if self._line is not None and self._line.fileno() in ready:
+            self._take_answer(self._line)
+        if self.state == "asking" and sys.stdin.fileno() in ready & set(own):
+            self._take_typed()
+        return ready & set(descriptors)
 
     def on_event(self, event: dict[str, object]) -> None:
         """Show an event of the run; its time gives the start of the run's clock."""
@@ -346,7 +340,7 @@ class ClosedLoop:
 
     def close(self) -> None:
         """End what is open, and report how the policy was followed."""
-        if self._line is not None and self._line.fileno() in self._ready(self._line.fileno(), 0):
+        if self._line is not None and linux.readable((self._line.fileno(),), 0):
             self._take_answer(self._line)
         if self._open is not None:
             self._end(self._open, "cut off", "the run ended before")
@@ -420,14 +414,18 @@ class ClosedLoop:
         else:
             self._log("question", f"{proposal.action}? y or n")
 
-    def _take_decision(self) -> None:
-        assert self._open is not None
+    def _take_typed(self) -> None:
         typed = os.read(sys.stdin.fileno(), 4096)
         self._input_ended = not typed
-        word = typed.decode(errors="replace").strip().lower()
+        self.decide(typed.decode(errors="replace").strip().lower() if typed else "n")
+
+    def decide(self, word: str) -> None:
+        """The answer of a person; nothing happens if there is no question."""
+        if self._open is None or self.state != "asking":
+            return
         if word in ("y", "yes"):
             self._carry_out(self._open)
-        elif self._input_ended or word in ("n", "no"):
+        elif word in ("n", "no"):
             self._decline(self._open)
         else:
             self._log("question", f"{self._open.action}? y or n; found {word[:20]!r}")

@@ -17,8 +17,11 @@ from aftbed.adapt.planner import Plan
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.messages import Goal
 from aftbed.inject.model import Fault
+from aftbed.runtime.control import ServiceState
 from aftbed.runtime.unix import run_directory
 from aftbed.runtime.unix.transport import Line
+from aftbed.vehicle.aeb.messages import Sight
+from aftbed.vehicle.plant import Telemetry
 
 ANSWER_SECONDS_MAX: Final = 2.0
 ADAPT_SECONDS_MAX: Final = 15.0  # to prepare, commit, observe and finish, on a busy machine
@@ -61,6 +64,24 @@ class AdaptCommand(msgspec.Struct, frozen=True, tag=True):
 
 class StopCommand(msgspec.Struct, frozen=True, tag=True):
     pass
+
+
+class Status(ServiceState, frozen=True, kw_only=True):
+    """The answer to a StatusQuery.
+
+    `vehicle` is the latest of a drive, `sees` that of a replay; `busy` names tasks of the executive.
+    """
+
+    run: str
+    adaptations: int
+    placement: str
+    seconds: float
+    busy: list[str]
+    record: str
+    port: int
+    bitrate_bps: int | None
+    vehicle: Telemetry | None
+    sees: Sight | None
 
 
 class PlanAnswer(msgspec.Struct, frozen=True):

@@ -44,6 +44,7 @@ class ControlServer:
         self._options, self._loop, self._work, self._finish = options, loop, work, finish
         self._deployment = controller.deployment
         self._faults, self._adaptations = controller.faults, controller.adaptations
+        self._state = controller.state
         self._started_ns = time.monotonic_ns()
         self._lines: dict[int, Line[ControlRequest]] = {}
         # Requests that came before the graph was complete; None since then.
@@ -114,7 +115,7 @@ class ControlServer:
         """Carry out one request; `answer` may be called later. Raises ConfigError."""
         match request:
             case control_client.StatusQuery():
-                answer(json.dumps(self._status()).encode())
+                answer(msgspec.json.encode(self._status()))
             case control_client.ProcessesQuery():
                 answer(msgspec.json.encode({"processes": self._processes()}))
             case control_client.GraphQuery():
@@ -148,25 +149,21 @@ class ControlServer:
             case _:
                 assert_never(request)
 
-    def _status(self) -> dict[str, object]:
-        deployment = self._deployment
-        return {
-            "run": self._options.run,
-            "ftm": deployment.graph.ftm,
-            "adapting": self._adaptations.busy,
-            "adaptations": len(self._adaptations.history),
-            "placement": self._options.placement,
-            "seconds": round((time.monotonic_ns() - self._started_ns) / 1e9, 2),
-            "leader": deployment.leader,
-            "backup": deployment.backup,
-            "epoch": deployment.epoch,
-            "busy": self._loop.tasks.names(),
-            "record": self._options.record,
-            "port": self._options.port,
-            "bitrate_bps": getattr(self._options.work, "bitrate_bps", None),
-            "vehicle": self._work.telemetry,
-            "cycle_us": self._work.cycle_us,
-        }
+    def _status(self) -> control_client.Status:
+        options, work = self._options, self._work
+        return control_client.Status(
+            **msgspec.structs.asdict(self._state(work.cycle_us, work.requests)),
+            run=options.run,
+            adaptations=len(self._adaptations.history),
+            placement=options.placement,
+            seconds=round((time.monotonic_ns() - self._started_ns) / 1e9, 2),
+            busy=self._loop.tasks.names(),
+            record=options.record,
+            port=options.port,
+            bitrate_bps=getattr(options.work, "bitrate_bps", None),
+            vehicle=work.telemetry,
+            sees=work.sight,
+        )
 
     def _processes(self) -> list[ProcessRow]:
         """Every process of the run; the nodes and the supervisor are the paper's count."""

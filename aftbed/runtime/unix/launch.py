@@ -222,7 +222,7 @@ class Launched:
             report, _ = got
             if isinstance(report, control.Report):
                 match report.kind:
-                    case "finished":
+                    case control.FINISHED:
                         self.end = msgspec.json.decode(report.data)
                     case "trouble":
                         self.trouble = report.data.decode()
@@ -354,6 +354,7 @@ def options_for(
     `evidence`: the options say which code this is, also of a run that verifies nothing and is not kept.
     """
     faults = tuple(with_names_resolved(fault, work) for fault in faults)
+    goals = tuple(one.goal.expression for one in adaptations if one.goal.expression)
     drive = _scenario(work) if isinstance(work, CarRun) else None
     verifies = tuple(dict.fromkeys((*verifies, *(drive.verifies if drive is not None else ()))))
     ensure_limits()
@@ -385,7 +386,7 @@ def options_for(
         ftti_ms=ftti_ms,
         verifies=verifies,
         command=command,
-        packages=(packages := packages_of(parse(ftm))),
+        packages=(packages := packages_of(name for one in (ftm, *goals) for name in parse(one))),
         code=code_version(packages) if evidence or verifies or record is not None else "",
     )
     return options, listener

@@ -6,6 +6,7 @@ supervisor the parent of whatever its descendants leave behind.
 
 import contextlib
 import ctypes
+import fcntl
 import os
 import resource
 import select
@@ -14,8 +15,9 @@ import site
 import socket
 import struct
 import sys
+import termios
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Final
@@ -241,9 +243,15 @@ def waited_ns(pid: int) -> int:
 
 def ends(pidfd: int, seconds: float) -> bool:
     """Whether that process ends within `seconds`."""
+    return bool(readable((pidfd,), seconds))
+
+
+def readable(descriptors: Iterable[int], seconds: float | None) -> set[int]:
+    """Those of `descriptors` that are readable or have ended, within `seconds`; None is no limit."""
     poll = select.poll()
-    poll.register(pidfd, select.POLLIN)
-    return bool(poll.poll(seconds * 1e3))
+    for descriptor in descriptors:
+        poll.register(descriptor, select.POLLIN)
+    return {descriptor for descriptor, _ in poll.poll(None if seconds is None else seconds * 1e3)}
 
 
 def reap(pid: int) -> int | None:
@@ -253,6 +261,12 @@ def reap(pid: int) -> int | None:
         if got == pid:
             return os.waitstatus_to_exitcode(status)
     return None
+
+
+def backlog(sock: socket.socket) -> float:
+    """How much of what fits is sent and not read yet: 0 to 1 (SIOCOUTQ, unix(7))."""
+    waiting = int.from_bytes(fcntl.ioctl(sock, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
+    return waiting / sock.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
 
 
 def set_timeouts(sock: socket.socket, receive_seconds: float, send_seconds: float) -> None:

@@ -85,7 +85,7 @@ class RunOptions(msgspec.Struct, frozen=True):
     tolerant time interval that the verdict holds against each fault; 0: none. `verifies`: requirements, of
     the command and of the scenario. `command`: as it was typed, "" if another program launched the run.
     `code`: the version of the code, "" where the run is neither kept nor evidence of a requirement.
-    `packages`: those that declare mechanisms of `ftm` which are not ours, by name and version.
+    `packages`: by name and version, those that declare mechanisms of `ftm` and `adaptations`.
     """
 
     run: str

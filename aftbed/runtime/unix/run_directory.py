@@ -42,6 +42,7 @@ from aftbed.runtime.unix import linux
 SOCKET_NAME: Final = "control"
 SOCKET_PATH_MAX: Final = 107  # bytes, unix(7), without the NUL
 HISTORY_NAME: Final = "adaptations.jsonl"  # in the record: a line for each adaptation that has ended
+EVENT_LOG_NAME: Final = "events.jsonl"  # in the record: what was printed
 BUS_NAME: Final = "bus.log"  # in the record: all frames of the bus
 ID_BYTES: Final = 3
 ANSWER_SECONDS_MAX: Final = 2.0

@@ -43,6 +43,10 @@ from aftbed.vehicle.condition import Condition
 
 LOOK_SECONDS: Final = 0.05  # between two looks at all nodes
 LOG_SECONDS: Final = 0.005  # until a line is written: a failover does not wait for that
+# How much may be unread for a report to be sent: of what fits.
+PICTURES_BACKLOG_MAX: Final = 0.5
+BACKLOG_MAX: Final = {control.EVENT: 0.75, control.FINISHED: 1.0}
+COUNTS_SECONDS: Final = 0.2  # between two reports that differ in counts alone, at least
 LATE_NS_MAX: Final = 40_000_000  # of a look: beyond it the machine was too busy to judge what hangs
 DRAIN_SECONDS_MAX: Final = 2.0
 DRAIN_SECONDS: Final = 0.005  # between two checks of what is still under way
@@ -134,8 +138,10 @@ class Supervisor:
         self._started_ns = time.monotonic_ns()
         self._owner = Line(owner, decode_order)
         self._owner.sock.setblocking(False)
-        self._events = open(self._record / "events.jsonl", "ab", buffering=0)  # noqa: SIM115
+        self._events = open(self._record / run_directory.EVENT_LOG_NAME, "ab", buffering=0)  # noqa: SIM115
         self._unwritten: list[bytes] = []  # lines of the log
+        self._shown: object = None  # to the command, of the state
+        self._counts_due_ns = 0
         self._graph_ms = 0.0
         self._waited_ns: dict[int, int] = {}  # for a CPU until the graph was complete, by pid
         self._last_look_ns = self._grace_until_ns = 0
@@ -148,7 +154,9 @@ class Supervisor:
 
         self._loop = EventLoop()
         self.pool = UnixProcessPool(self._loop, self._on_report, self._on_death, ledger)
-        self._work = Workload(options, self.pool, self._loop, self._log, self._finish, self._report_owner)
+        self._work = Workload(
+            options, self.pool, self._loop, self._log, self._finish, self._report_owner, self._report_state
+        )
         runtime = UnixRuntime(options, self._loop, self.pool, self._work, self._log)
         cpus = sorted(os.sched_getaffinity(0))
         pinned = cpus if options.pin and len(cpus) > 1 else None
@@ -256,11 +264,25 @@ class Supervisor:
             self._finish("interrupted")
 
     def _report_owner(self, kind: str, data: bytes) -> None:
-        """To the command; dropped if it does not read, since a view must not stop a run."""
+        """To the command; dropped if it does not read (Ctrl-Z), since a view must not stop a run.
+
+        Pictures are dropped first, then events, so that there is room for how the run has ended.
+        """
         try:
-            self._owner.send(control.Report(kind, data))
+            if linux.backlog(self._owner.sock) <= BACKLOG_MAX.get(kind, PICTURES_BACKLOG_MAX):
+                self._owner.send(control.Report(kind, data))
         except OSError:
             return
+
+    def _report_state(self) -> None:
+        """To the command, if it is another one. Each change of it but the counts is logged, and so seen."""
+        state, now_ns = self._controller.state(self._work.cycle_us, self._work.requests), time.monotonic_ns()
+        counts_only = (state.roles, state.ftm, state.adapting) == self._shown
+        if counts_only and now_ns < self._counts_due_ns:
+            return
+        self._shown = (state.roles, state.ftm, state.adapting)
+        self._counts_due_ns = now_ns + round(COUNTS_SECONDS * 1e9)
+        self._report_owner(control.STATE, msgspec.msgpack.encode(state))
 
     def _log(self, event: str, text: str) -> None:
         """A line for people, to the record and to the command."""
@@ -276,7 +298,8 @@ class Supervisor:
         lines, self._unwritten = self._unwritten, []
         self._events.write(b"".join(line + b"\n" for line in lines))
         for line in lines:
-            self._report_owner("event", line)
+            self._report_owner(control.EVENT, line)
+        self._report_state()
 
     # -- the end ------------------------------------------------------------------------------
 
@@ -347,7 +370,7 @@ class Supervisor:
         new = self._record / "end.json.new"
         new.write_text(json.dumps(end))
         new.rename(self._record / "end.json")  # complete, or not there
-        self._report_owner("finished", json.dumps(end).encode())
+        self._report_owner(control.FINISHED, json.dumps(end).encode())
 
     def _let_end(self, hub: UnixProcess) -> None:
         """Give the hub time to tell its clients that the run has ended."""

@@ -30,12 +30,14 @@ from aftbed.runtime.unix.event_loop import EventLoop
 from aftbed.runtime.unix.options import PLAYER, CarRun, LoadRun, RunOptions, SourceOptions
 from aftbed.runtime.unix.process_pool import UnixProcess, UnixProcessPool
 from aftbed.runtime.unix.run_directory import BUS_NAME
+from aftbed.vehicle.aeb.messages import Sight
 from aftbed.vehicle.condition import Condition
+from aftbed.vehicle.plant import Telemetry
 
 ATTACH_SECONDS_MAX: Final = 10.0
 LOAD_POLL_SECONDS: Final = (0.02, 0.5)  # between two questions how far a load has come: at least, at most
 STALL_SECONDS_MAX: Final = 3.0  # a recovery takes milliseconds, a loss is seen after half a second
-CYCLE_EVERY: Final = 10  # telemetry reports, after which the cycle time is shown
+CYCLE_EVERY: Final = 10  # reports of the car, after which requests are counted
 VEHICLE: Final = "vehicle"
 SECRET_BYTES: Final = 16
 
@@ -142,9 +144,11 @@ class Workload:
         log: Callable[[str, str], None],
         finish: Callable[[str], None],
         report_owner: Callable[[str, bytes], None],
+        counted: Callable[[], None],
     ) -> None:
+        """`report_owner`: a report to the command; `counted`: `requests` and `cycle_us` are new."""
         self._options, self._pool, self._loop = options, pool, loop
-        self._log, self._finish, self._report_owner = log, finish, report_owner
+        self._log, self._finish, self._report_owner, self._counted = log, finish, report_owner, counted
         self._is_load = isinstance(options.work, LoadRun)
         self._secret = secrets.token_hex(SECRET_BYTES)  # of the bus: for the processes of this run alone
         self._source = VEHICLE if isinstance(options.work, CarRun) else PLAYER  # of a run with a bus
@@ -153,11 +157,11 @@ class Workload:
         self.bus = CarFaults(pool, loop.tasks.settle, log)
         self._result: object = None
         self._stats: dict[str, object] = {}
-        self.telemetry: dict[str, object] | None = None
-        self.cycle_us: float | None = None  # at the client, from request to reply; the latest that is known
+        self.telemetry: Telemetry | None = None  # of a drive
+        self.sight: Sight | None = None  # of a replay
         self.ended, self.awaits_replies = False, True
         self._stalled = False
-        self._telemetries = 0
+        self._reported = 0
         self._progress: tuple[object, object] = (None, None)
         self._moved_ns = time.monotonic_ns()
 
@@ -257,12 +261,12 @@ class Workload:
             self._loop.tasks.settle(("ready", process.name, 0))
         elif kind in control.BUS_REPORTS:
             self.bus.on_report(kind, data)
-        elif kind == "telemetry":
-            self.telemetry = msgspec.msgpack.decode(data)
-            self._report_owner("telemetry", data)
-            self._telemetries += 1
-            if self._telemetries % CYCLE_EVERY == 0:
-                self._loop.tasks.start(STATS_TASK, self._ask_stats(), self._report_cycle)
+        elif kind == control.TELEMETRY:
+            self.telemetry = msgspec.msgpack.decode(data, type=Telemetry)
+            self._show(kind, data)
+        elif kind == control.SIGHT:
+            self.sight = msgspec.msgpack.decode(data, type=Sight)
+            self._show(kind, data)
         elif kind == "trouble":
             self._log("trouble", f"{process.name}: {data.decode()}")
             self._finish(f"{process.name}: {data.decode()}")
@@ -271,11 +275,26 @@ class Workload:
             process.kind = ProcessKind.KILLED  # it has finished: its death is expected
             self._finish("")
 
-    def _report_cycle(self, failure: str) -> None:
-        if not failure:
-            cycle_us = self._stats.get("cycle_us")
-            self.cycle_us = cycle_us if isinstance(cycle_us, float | int) else None
-            self._report_owner("cycle", json.dumps(self.cycle_us).encode())
+    def _show(self, kind: str, data: bytes) -> None:
+        """Report what the car does, and now and then what is counted."""
+        self._report_owner(kind, data)
+        self._reported += 1
+        if self._reported % CYCLE_EVERY == 0:
+            self._loop.tasks.start(STATS_TASK, self._ask_stats(), lambda _: self._counted())
+
+    @property
+    def requests(self) -> control.RequestCounts | None:
+        """As last asked for."""
+        match self._stats:
+            case {"sent": int(sent), "answered": int(answered)}:
+                return control.RequestCounts(sent, answered)
+        return None
+
+    @property
+    def cycle_us(self) -> float | None:
+        """At the client, from request to reply; the latest that is known."""
+        cycle_us = self._stats.get("cycle_us")
+        return cycle_us if isinstance(cycle_us, float | int) else None
 
     def _poll_load(self) -> None:
         """Watch the load again when it can be over; now and then, in case nothing moves any more."""
@@ -291,6 +310,7 @@ class Workload:
             progress, now_ns = (self._stats.get("sent"), self._stats.get("unanswered")), time.monotonic_ns()
             if progress != self._progress:
                 self._progress, self._moved_ns = progress, now_ns
+            self._counted()
             if self._stats.get("done"):
                 self._finish("")
             elif now_ns - self._moved_ns > STALL_SECONDS_MAX * 1e9:

@@ -78,6 +78,36 @@ class AebOutput(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fie
     counter: int | None
 
 
+class Sight(msgspec.Struct, frozen=True):
+    """What the function sees in one radar cycle, and asks of the brakes: for people.
+
+    None is unknown, or there is none. `range_m` is that of the nearest of the `targets`, `ttc_s` that of the
+    worst.
+    """
+
+    t_ms: int
+    speed_ms: float | None
+    targets: int | None
+    range_m: float | None
+    ttc_s: float | None
+    stage: int
+    deceleration_ms2: float
+
+
+def sight_of(cycle: AebInput, stage: int, deceleration_ms2: float) -> Sight:
+    targets = cycle.targets
+    times_s = (one.range_m / -one.rel_speed_ms for one in targets if one.rel_speed_ms < 0)
+    return Sight(
+        t_ms=cycle.t_ms,
+        speed_ms=cycle.ego_speed_ms if cycle.ego_valid else None,
+        targets=len(targets) if cycle.radar_valid else None,
+        range_m=min((one.range_m for one in targets), default=None),
+        ttc_s=min(times_s, default=None),
+        stage=stage,
+        deceleration_ms2=deceleration_ms2,
+    )
+
+
 FIXED_LAYOUT: Final = 1
 FIXED_REQUEST: Final = Struct("<BQdBBBdd")
 FIXED_REPLY: Final = Struct("<d")

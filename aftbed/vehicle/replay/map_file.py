@@ -29,8 +29,8 @@ from typing import Annotated, Final, Literal
 import msgspec
 from msgspec import Meta
 
-from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.yaml_file import read_yaml
+from aftbed.core.errors import ConfigError, FileKeyError, unknown
+from aftbed.core.yaml_file import in_file, read_yaml
 from aftbed.vehicle.aeb.messages import SLOTS
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.e2e import (
@@ -338,12 +338,14 @@ def load_mapped(path: Path, dbc: Path) -> Codec:
 def bind(path: Path, dbc: Path) -> BoundMap:
     """Read the map at `path` and check all of it against the DBC. Raises ConfigError."""
     file = read_yaml(path, MapFile)
-    return bind_file(file, path, load_dbc(dbc, strict=file.strict))
+    codec = load_dbc(dbc, strict=file.strict)
+    with in_file(path):
+        return bind_file(file, codec)
 
 
-def bind_file(file: MapFile, path: Path, codec: Codec) -> BoundMap:
-    """Check a map that was read, or is going to be written, at `path`. Raises ConfigError."""
-    return _Binding(path, codec, file).bound()
+def bind_file(file: MapFile, codec: Codec) -> BoundMap:
+    """Check a map that was read, or is going to be written. Raises ConfigError."""
+    return _Binding(codec, file).bound()
 
 
 Source = EgoMap | TrackMap | OtherMap
@@ -352,8 +354,7 @@ Source = EgoMap | TrackMap | OtherMap
 class _Binding:
     """The checks; each error names the file, the key, what was found and what is allowed."""
 
-    def __init__(self, path: Path, codec: Codec, file: MapFile) -> None:
-        self._path = path
+    def __init__(self, codec: Codec, file: MapFile) -> None:
         self._codec = codec
         self._file = file
         self._rules: dict[int, FrameRule] = {}
@@ -522,7 +523,7 @@ class _Binding:
         """The id of a message that has a rule."""
         ids = {rule.name: rule.can_id for rule in self._rules.values() if rule.name is not None}
         if message not in ids:
-            raise ConfigError(f"{self._path}: {key}: {unknown('mapped message', message, ids)}")
+            raise FileKeyError(key, unknown("mapped message", message, ids))
         return ids[message]
 
     # -- names and places
@@ -605,7 +606,7 @@ class _Binding:
         near = get_close_matches(found, names, n=NAMES_SHOWN_MAX, cutoff=0.0)
         more = f" and {len(names) - len(near)} more" if len(names) > len(near) else ""
         reason = f"{unknown(what, found, near)}{more}, by {self._codec.path}{self._codec.left_out()}"
-        return ConfigError(f"{self._path}: {key}: {reason}")
+        return FileKeyError(key, reason)
 
     def _check_whole(self, key: str, name: str, signal: str) -> None:
         self._check_signal(key, name, signal)
@@ -617,4 +618,4 @@ class _Binding:
             raise self._error(key, names, "exactly one of them")
 
     def _error(self, key: str, found: str, allowed: str) -> ConfigError:
-        return ConfigError(f"{self._path}: {key}: found {found}, allowed is {allowed}")
+        return FileKeyError(key, f"found {found}, allowed is {allowed}")

@@ -16,7 +16,6 @@ import re
 from collections import Counter as Counts
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
-from pathlib import Path
 from statistics import median
 from typing import Final, TypeVar
 
@@ -343,12 +342,12 @@ class _Proposing:
         proposal = MapProposal(plain, None, tuple(self._problems))
         if "ego" not in plain:
             return proposal
-        path = Path("the proposed map")
         try:
             file = msgspec.convert(yaml.safe_load(proposal.text()), MapFile)
-            bound = bind_file(file, path, self._codec)
+            bound = bind_file(file, self._codec)
         except (ConfigError, msgspec.ValidationError) as error:  # a signal beyond what a map may have
-            return msgspec.structs.replace(proposal, problems=(*proposal.problems, str(error)))
+            problem = f"the proposed map: {error}"
+            return msgspec.structs.replace(proposal, problems=(*proposal.problems, problem))
         return msgspec.structs.replace(proposal, bound=bound)
 
     @staticmethod

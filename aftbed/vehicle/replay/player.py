@@ -73,6 +73,7 @@ def play(
     *,
     ends_cycle: Callable[[Frame], bool],
     stop: Callable[[], bool],
+    answered: Callable[[int, float], None] = lambda stage, deceleration_ms2: None,
     pause_us: int | None = None,
     until_us: int | None = None,
 ) -> PlayReport:
@@ -81,18 +82,25 @@ def play(
     With a pause, it begins again that long behind its last frame, and so on. `until_us` of bus time, or
     without it the end of the log, is its end as asked for.
 
-    `ends_cycle` is asked once for each frame, in order, with the bus time in the frame. Raises
-    HarnessError when the bus fails.
+    `ends_cycle` is asked once for each frame, in order, with the bus time in the frame. `answered` is called
+    with the stage and the deceleration of each answer. Raises HarnessError when the bus fails.
     """
-    return _Player(codec, bus, pace, stop).run(log, ends_cycle, pause_us, until_us)
+    return _Player(codec, bus, pace, stop, answered).run(log, ends_cycle, pause_us, until_us)
 
 
 class _Player:
-    def __init__(self, codec: Codec, bus: Bus, pace: float | None, stop: Callable[[], bool]) -> None:
+    def __init__(
+        self,
+        codec: Codec,
+        bus: Bus,
+        pace: float | None,
+        stop: Callable[[], bool],
+        answered: Callable[[int, float], None],
+    ) -> None:
         self._report = PlayReport()
         self._codec = codec
         self._bus = bus
-        self._stop = stop
+        self._stop, self._answered = stop, answered
         self._schedule = None if pace is None else Schedule(pace)
         self._answer_id = codec.can_id("AEB_REQ")
         self._watch = AnswerWatch(bus, self._answer_id, self._receive)
@@ -146,8 +154,10 @@ class _Player:
         except PeerError:
             report.malformed_answers += 1
             return
-        report.stage_max = max(report.stage_max, int(answer["STAGE"]))
-        report.deceleration_ms2_max = max(report.deceleration_ms2_max, answer["DECELERATION"])
+        stage, deceleration_ms2 = int(answer["STAGE"]), answer["DECELERATION"]
+        report.stage_max = max(report.stage_max, stage)
+        report.deceleration_ms2_max = max(report.deceleration_ms2_max, deceleration_ms2)
+        self._answered(stage, deceleration_ms2)
 
 
 def _in_bus_time(log: Sequence[Frame], pause_us: int | None) -> Iterator[Frame]:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import FileKeyError
 from aftbed.core.requirements import check_requirements
 from aftbed.vehicle.plant import (
     DEAD_TIME_MS,
@@ -134,23 +134,20 @@ class ScenarioKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     verifies: tuple[str, ...] = ()  # requirements that a drive of it verifies, as [SG-1]
 
 
-def scenario_of(name: str, where: str, keys: ScenarioKeys) -> Scenario:
-    """The scenario that `keys` describe. Raises ConfigError, which begins with `where`."""
+def scenario_of(name: str, keys: ScenarioKeys) -> Scenario:
+    """The scenario that `keys` describe. Raises FileKeyError."""
     brakes, driver = keys.brakes, keys.driver
     setup = PlantSetup(
         speed_ms=keys.ego.speed_kmh / KMH_PER_MS,
-        lead=_lead(where, keys.lead, keys.ego.speed_kmh) if keys.lead else None,
+        lead=_lead(keys.lead, keys.ego.speed_kmh) if keys.lead else None,
         friction=keys.road.friction,
         brakes=Brakes(
             _ms(brakes.dead_time_s), _ms(brakes.lag_s), brakes.jerk_max_ms3, brakes.deceleration_max_ms2
         ),
         driver=Driver(_ms(driver.reaction_s), driver.deceleration_ms2) if driver else None,
     )
-    try:
-        check_requirements("verifies", keys.verifies)
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
-    ends = _slow_end(where, keys) if keys.ends else None
+    check_requirements("verifies", keys.verifies)
+    ends = _slow_end(keys) if keys.ends else None
     return Scenario(name, keys.description, _ms(keys.duration_s), setup, keys.expect, keys.verifies, ends)
 
 
@@ -158,33 +155,33 @@ def _ms(duration_s: float) -> int:
     return round(duration_s * 1000)
 
 
-def _lead(where: str, keys: LeadKeys, ego_kmh: float) -> LeadCar:
+def _lead(keys: LeadKeys, ego_kmh: float) -> LeadCar:
     if (keys.gap_m is None) == (keys.ttc_s is None):
         given = "none of them" if keys.gap_m is None else "both"
-        raise ConfigError(f"{where}: lead: found {given}, allowed is one of gap_m, ttc_s")
+        raise FileKeyError("lead", f"found {given}, allowed is one of gap_m, ttc_s")
     if keys.ttc_s is not None:
         closing_kmh = ego_kmh - keys.speed_kmh
         if closing_kmh <= 0.0:
             reason = f"found {keys.ttc_s}, allowed is gap_m, because the gap does not close"
-            raise ConfigError(f"{where}: lead.ttc_s: {reason}")
+            raise FileKeyError("lead.ttc_s", reason)
         gap_m = keys.ttc_s * closing_kmh / KMH_PER_MS
     else:
         assert keys.gap_m is not None
         gap_m = keys.gap_m
         if gap_m == 0.0:  # a collision before the start
-            raise ConfigError(f"{where}: lead.gap_m: found 0, allowed is more than 0")
+            raise FileKeyError("lead.gap_m", "found 0, allowed is more than 0")
     braking, cut_in = keys.braking, keys.cut_in
     if braking and keys.speeds:
-        raise ConfigError(f"{where}: lead: found both, allowed is one of braking, speeds")
+        raise FileKeyError("lead", "found both, allowed is one of braking, speeds")
     times_s = [change.after_s for change in keys.speeds]
     if times_s != sorted(set(times_s)):
-        raise ConfigError(f"{where}: lead.speeds: found {times_s}, allowed is one after the other")
+        raise FileKeyError("lead.speeds", f"found {times_s}, allowed is one after the other")
     if cut_in and keys.lateral_m == 0.0:
-        raise ConfigError(f"{where}: lead.cut_in: found without lateral_m, allowed is a car beside our lane")
+        raise FileKeyError("lead.cut_in", "found without lateral_m, allowed is a car beside our lane")
     return LeadCar(
         gap_m=gap_m,
         speed_ms=keys.speed_kmh / KMH_PER_MS,
-        braking=_braking(where, braking, keys.speed_kmh) if braking else None,
+        braking=_braking(braking, keys.speed_kmh) if braking else None,
         lateral_m=keys.lateral_m,
         cut_in=CutIn(_ms(cut_in.after_s), max(1, _ms(cut_in.over_s))) if cut_in else None,
         speeds=tuple(
@@ -193,26 +190,26 @@ def _lead(where: str, keys: LeadKeys, ego_kmh: float) -> LeadCar:
     )
 
 
-def _slow_end(where: str, keys: ScenarioKeys) -> SlowEnd:
+def _slow_end(keys: ScenarioKeys) -> SlowEnd:
     ends = keys.ends
     assert ends is not None
     if ends.below_kmh is None and ends.below_lead_kmh is None:
-        raise ConfigError(f"{where}: ends: found none of them, allowed is below_kmh, below_lead_kmh or both")
+        raise FileKeyError("ends", "found none of them, allowed is below_kmh, below_lead_kmh or both")
     if ends.below_kmh is not None and ends.below_kmh > keys.ego.speed_kmh:
         allowed = f"allowed is at most ego.speed_kmh, {keys.ego.speed_kmh:g}"
-        raise ConfigError(f"{where}: ends.below_kmh: found {ends.below_kmh:g}, {allowed}")
+        raise FileKeyError("ends.below_kmh", f"found {ends.below_kmh:g}, {allowed}")
     if ends.below_lead_kmh is not None and keys.lead is None:
-        raise ConfigError(f"{where}: ends.below_lead_kmh: found without lead, allowed is below_kmh")
+        raise FileKeyError("ends.below_lead_kmh", "found without lead, allowed is below_kmh")
     below_ms, below_lead_ms = (
         None if kmh is None else kmh / KMH_PER_MS for kmh in (ends.below_kmh, ends.below_lead_kmh)
     )
     return SlowEnd(_ms(ends.after_s), below_ms, below_lead_ms)
 
 
-def _braking(where: str, keys: BrakingKeys, lead_kmh: float) -> LeadBraking:
+def _braking(keys: BrakingKeys, lead_kmh: float) -> LeadBraking:
     if keys.to_kmh > 0.0 and keys.to_kmh >= lead_kmh:
         allowed = f"allowed is less than lead.speed_kmh, {lead_kmh:g}"
-        raise ConfigError(f"{where}: lead.braking.to_kmh: found {keys.to_kmh:g}, {allowed}")
+        raise FileKeyError("lead.braking.to_kmh", f"found {keys.to_kmh:g}, {allowed}")
     ramp_ms, final_ms = _ms(keys.ramp_s), keys.to_kmh / KMH_PER_MS
     return LeadBraking(_ms(keys.after_s), keys.deceleration_ms2, ramp_ms, final_ms)
 

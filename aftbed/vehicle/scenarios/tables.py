@@ -181,4 +181,4 @@ def _scenario(case: Case, group: _Group) -> Scenario:
         brakes=group.brakes,
         driver=group.driver,
     )
-    return scenario_of(case.name, f"{_FOLDER / case.table}.yaml: {case.group}", keys)
+    return scenario_of(case.name, keys)

@@ -48,6 +48,11 @@ def test_of_two_windows_the_lower_one_is_the_median() -> None:
     assert (found.windows, found.p50_percent, found.max_percent) == (2, 0.27, 0.54)
 
 
+def test_a_window_that_has_only_begun_does_not_count() -> None:
+    found = bus_load(lines([(0, 8), *[(100_000, 8)] * 1000]), 500_000)
+    assert found == BusLoad(500_000, 1, 0.27, 0.27, 0.22, 0.22)
+
+
 @pytest.mark.parametrize("times", [[], [7], [0, 99_999]])
 def test_a_log_shorter_than_a_window_has_no_load(times: list[int]) -> None:
     assert bus_load(lines((t_us, 8) for t_us in times), 500_000) is None

@@ -244,6 +244,6 @@ def test_of_the_names_of_another_radar_the_nearest_are_shown() -> None:
     with pytest.raises(ConfigError) as error:
         bind(find_map("toyota-tss2"), find_dbc("esr-like"))
     found = str(error.value)
-    assert "tracks.messages.name: unknown message 'TRACK_A_0' (one of: ESR_Track" in found
-    assert found.count("ESR_Track") == 10
+    assert "tracks.messages.name: unknown message 'TRACK_A_0'; did you mean 'ESR_Track" in found
+    assert found.count("ESR_Track") == 11
     assert " and 54 more, by " in found

@@ -265,7 +265,7 @@ def test_raw_signals_count_bits_as_a_dbc_does(raw: RawSignal, value: float) -> N
         ),
         ("range: {signal: RANGE, ", "range: {", "tracks.range: found signal and raw, allowed is exactly one"),
         ("description: a small radar", "description: [", "line "),
-        ("cycle_ms: 50", "cycle_ms: 50\ncycle_ms: 40", "line 4: key 'cycle_ms' stands twice"),
+        ("cycle_ms: 50", "cycle_ms: 50\ncycle_ms: 40", "line 4, column 1: key 'cycle_ms' stands twice"),
     ],
 )
 def test_a_map_that_does_not_fit_is_refused(make: Make, old: str, new: str, reason: str) -> None:

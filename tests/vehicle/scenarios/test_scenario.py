@@ -324,7 +324,7 @@ def test_a_gap_may_be_given_as_time_to_collision(tmp_path: Path) -> None:
         ("description: a test", "description: {", "line "),
         (GOOD, "- 1\n", "found [1], allowed is keys and values: description"),
         (GOOD, "", "key 'description' is missing"),
-        (GOOD, "? [a]\n: 1\n", "line 1: "),
+        (GOOD, "? [a]\n: 1\n", "line 1, column 3: "),
         ("description: a test", "description: a test\n7: 1", "allowed is"),
         ("expect:", "expectation:", "unknown key 'expectation'; did you mean 'expect'"),
     ],
