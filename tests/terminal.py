@@ -27,6 +27,7 @@ class Terminal:
         self._status: int | None = None
         self.fd, theirs = os.openpty()
         self._set_size(columns, rows)
+        self.before = self.modes  # nothing has set the terminal yet
         self.pid = os.fork()
         if self.pid == 0:
             os.close(self.fd)

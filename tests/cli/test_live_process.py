@@ -226,7 +226,7 @@ def test_a_run_is_steered_by_keys(home: Home) -> None:
         os.execv(sys.executable, [sys.executable, "-m", "aftbed", "run", *drive])
 
     with Terminal(command, 100, 40) as terminal:
-        before = terminal.modes
+        before = terminal.before
         terminal.until_shown("pbr  a leads, b backs up, epoch 1")
         terminal.type("icrash primary\n")
         terminal.until_shown("pbr  b leads, a backs up, epoch 2")

@@ -204,7 +204,7 @@ def given_back(terminal: Terminal, before: list[object]) -> bool:
 )
 def test_the_terminal_is_given_back_at_a_signal(sig: signal.Signals, code: int) -> None:
     with FakeRun() as run:
-        before = run.terminal.modes
+        before = run.terminal.before
         run.report(STATE)
         run.terminal.until_shown("a leads")
         assert run.terminal.modes != before
@@ -215,7 +215,7 @@ def test_the_terminal_is_given_back_at_a_signal(sig: signal.Signals, code: int) 
 
 def test_the_terminal_is_given_back_when_the_run_ends_or_the_view_fails() -> None:
     with FakeRun() as run:
-        before = run.terminal.modes
+        before = run.terminal.before
         run.terminal.until_shown("starting")
         run.end()
         assert run.terminal.code() == 0
@@ -231,7 +231,7 @@ def test_the_terminal_is_given_back_when_the_run_ends_or_the_view_fails() -> Non
 
 def test_a_view_is_suspended_and_continued() -> None:
     with FakeRun() as run:
-        before = run.terminal.modes
+        before = run.terminal.before
         run.report(STATE)
         run.terminal.until_shown("a leads")
         during = run.terminal.modes
@@ -261,7 +261,7 @@ def test_a_terminal_that_does_not_read_does_not_stop_the_run() -> None:
 def test_a_run_ends_though_its_terminal_does_not_read() -> None:
     """What gives the terminal back comes before the verdict, when it reads again."""
     with FakeRun() as run:
-        before = run.terminal.modes
+        before = run.terminal.before
         run.report(STATE)
         run.terminal.until_shown("a leads")
         run.terminal.type("\x13")
@@ -390,7 +390,7 @@ def test_keys_are_not_read_where_standard_input_is_no_terminal() -> None:
         return 0
 
     with Terminal(command) as terminal:
-        before = terminal.modes
+        before = terminal.before
         assert terminal.code() == 0
         assert b"[] b'q'" in terminal.raw
         assert terminal.modes == before
