@@ -30,4 +30,4 @@ def test_every_experiment_is_carried_out(home: Home, options: tuple[str, ...]) -
 def test_an_unknown_placement_is_refused(home: Home) -> None:
     done = aftbed("bench", "campaign", "--placement", "nowhere")
     assert done.code == 2
-    assert "system.placements: unknown" in done.err and "nowhere" in done.err
+    assert "system.placements[0]: unknown name 'nowhere'" in done.err
