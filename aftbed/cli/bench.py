@@ -20,7 +20,7 @@ from aftbed.cli.options import App, Ftm, Json, Recipe, check_range, choices, pri
 from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import PLACEMENTS
-from aftbed.ftm.compose import DUPLEX, replication_of
+from aftbed.ftm.compose import DUPLEX, canonical, replication_of
 from aftbed.functions.load import OWN_CODE
 from aftbed.functions.request_file import located_requests, requests_from
 from aftbed.functions.source import located
@@ -104,6 +104,8 @@ def adapt(
     json: Json = False,
 ) -> None:
     """Adaptations there and back under load: the blackout at the client, and what is lost."""
+    if canonical(old) == canonical(new):
+        raise ConfigError(f"--from {old} --to {new}: the same mechanism; two different ones are allowed")
     with _measuring("adapt", as_json=json) as progress:
         found = bench_adapt(
             old, new, placement, recipe, adaptations, pin=pin, rounds=rounds, show=progress.show

@@ -13,6 +13,7 @@ from typing import Final
 
 from PIL import Image  # a part of matplotlib
 from rich.console import Console
+from rich.terminal_theme import MONOKAI
 from rich.text import Text
 
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -29,7 +30,7 @@ SOCKET: Final = f"aftbed-pictures-{os.getpid()}"  # of a tmux of our own
 CRASH: Final = "crash primary at checkpoint.sent nth 100"
 LATE_CRASH: Final = "crash primary at server.exit nth 120"
 TERMINAL: Final = """<body style="margin:0"><pre style="display:inline-block; margin:0; padding:14px 18px;
-background:#16191d; color:#d8dce1; font:14px/1.25 'DejaVu Sans Mono', monospace">{code}</pre>"""
+background:#0c0c0c; color:#d9d9d9; font:14px/1.25 'DejaVu Sans Mono', monospace">{code}</pre>"""
 
 
 def live_page(folder: Path) -> None:
@@ -74,7 +75,7 @@ def terminal(folder: Path) -> None:
     console = Console(record=True, width=COLUMNS, force_terminal=True, file=(folder / "shown").open("w"))
     console.print(Text.from_ansi(shown.rstrip("\n")))
     file = folder / "terminal.html"
-    file.write_text(console.export_html(code_format=TERMINAL, inline_styles=True))
+    file.write_text(console.export_html(theme=MONOKAI, code_format=TERMINAL, inline_styles=True))
     with driven(folder) as page:
         page.open(file.as_uri())
         page.until("document.readyState == 'complete'")
@@ -145,7 +146,7 @@ def main(names: list[str]) -> None:
             sys.exit(f"make pictures: {tool} is not installed: apt-get install {tool.lower()}")
     PICTURES.mkdir(exist_ok=True)
     for name in names or makers:
-        with tempfile.TemporaryDirectory(prefix="aft-", dir="/tmp") as folder:
+        with tempfile.TemporaryDirectory(prefix="aft-", dir="/tmp", ignore_cleanup_errors=True) as folder:
             os.environ["XDG_RUNTIME_DIR"] = folder  # no run of the user is seen, nor this one by the user
             makers[name](Path(folder))
         print(name)
