@@ -57,11 +57,15 @@ class RunController:
         self.ending = False
         self.scripts: list[ScriptRun] = []  # of Recovery
 
+    def under_way(self) -> list[str]:
+        """What has begun and not ended. An adaptation that is observed has no task meanwhile."""
+        script = ["a script"] if self.executor.busy or self.adaptations.busy else []
+        return script + self._loop.tasks.names()
+
     def unrest(self) -> list[str]:
         """Why the run is not at rest, as far as is known; a backup may be missing."""
         deployment = self.deployment
-        found = ["a script is under way"] if self.executor.busy or self.adaptations.busy else []
-        found += [f"{name} is under way" for name in self._loop.tasks.names()]
+        found = [f"{name} is under way" for name in self.under_way()]
         needed = set(deployment.graph.nodes)
         for slot in deployment.slots.values():
             if slot.name != deployment.leader:

@@ -295,6 +295,15 @@ MUTANTS: Final = (
         (KILLS + "test_there_are_the_seventeen_processes_of_the_paper",),
     ),
     SourceMutant(
+        "a run that ends while an adaptation is observed has nothing under way",
+        "G5",
+        "aftbed/runtime/run_controller.py",
+        "        return script + self._loop.tasks.names()\n",
+        "        return self._loop.tasks.names()\n",
+        UNIT,
+        ("tests/sim/test_drains.py",),
+    ),
+    SourceMutant(
         "the warden leaves the run's directory",
         "G7",
         f"{UNIX}/cleanup.py",

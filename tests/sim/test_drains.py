@@ -31,3 +31,19 @@ def test_a_follower_that_was_stopped_works_off_its_requests_and_is_switched(node
     run = switched(node)
     assert [a.outcome for a in run.adaptations] == ["done"]
     assert breaches(run) == ()
+
+
+def test_an_adaptation_is_under_way_while_it_is_observed_though_it_has_no_task() -> None:
+    """A run that ends then has the old bricks beside the new ones, and its graph is not judged."""
+    world = World(Setup("pbr", "process", 0, 200, 1000.0))
+    world.start()
+    world.advance(world.loop.ns + 5 * MS)
+    world.adapt(Goal(expression="pbr+tr"))
+    controller, seen = world.controller, 0
+    while controller.adaptations.busy:
+        world.advance(world.loop.ns + MS)
+        if controller.adaptations.busy and not world.loop.tasks.names():
+            assert controller.under_way() == ["a script"]
+            seen += 1
+    assert seen > 10  # ms of the observation
+    assert controller.under_way() == []

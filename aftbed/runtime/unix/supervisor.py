@@ -325,7 +325,7 @@ class Supervisor:
             return
         if command_gone or settled or time.monotonic_ns() > limit_ns:
             if not settled and not command_gone:
-                self._unfinished = self._loop.tasks.names()
+                self._unfinished = self._controller.under_way()
             self._controller.ending = True
             self._loop.end()
             return
