@@ -79,7 +79,7 @@ def draw_diagrams(app: "Sphinx", doctree: Any) -> None:
 
 
 def write_index(app: "Sphinx", failure: Exception | None) -> None:
-    """A server, and a person who opens the folder, looks for index.html."""
+    """A server looks for index.html, and so does a person."""
     if failure is None:
         shutil.copy(Path(app.outdir) / f"{root_doc}.html", Path(app.outdir) / "index.html")
 

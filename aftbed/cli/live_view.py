@@ -1,4 +1,4 @@
-"""The view of a live run on a terminal: the road, who serves, what is counted, what happens; and keys.
+"""The view of a live run on a terminal: the road, the roles, counts, events; and keys.
 
 | key      | does                                                                             |
 |----------|----------------------------------------------------------------------------------|
@@ -9,7 +9,7 @@
 | `?`      | explains the keys                                                                |
 
 **Why `p` does not pause the run.** Its clocks are real: while the car stood still, the radar would be silent,
-and the E2E timeouts of gateway and brakes would notice that as a fault which nobody injected. Each deadline
+and the E2E timeouts of gateway and brakes would notice that as a fault that was not injected. Each deadline
 of the judge would count the time of the pause, too.
 
 What is shown is a `RunPicture`; `lines_of` lays it out for any size, and draws nothing by itself. A command

@@ -31,7 +31,7 @@ EXIT_STATUS: Final = (
     ("2", "Usage: an unknown name, a wrong value, an unreadable file, no live run."),
     ("3", "Inconclusive: trouble of the harness, or a fault or an adaptation that did not happen."),
     ("130", "Interrupted, and cleaned up."),
-    ("141", "Nobody reads the output any more; cleaned up."),
+    ("141", "The output has no reader any more; cleaned up."),
 )
 ENVIRONMENT: Final = (
     ("XDG_RUNTIME_DIR", "Runs have their directories below it."),

@@ -8,7 +8,7 @@ what is kept is never more than one.
 **Signals.** Handlers only wake `descriptors`; `attend` then acts, where nothing is half done. SIGWINCH:
 everything is drawn again, at the new size. SIGTSTP (Ctrl-Z): the terminal is given back, the process stops,
 and takes the terminal again when it is continued. SIGHUP and SIGQUIT: it is given back, and the process dies
-of the signal as it would have done. SIGINT and SIGTERM are the caller's, who leaves the `with` block.
+of the signal as it would have done. SIGINT and SIGTERM are the caller's, which leaves the `with` block.
 
 **In the background** (`&`, `bg`) nothing is drawn, read or set, since the kernel would stop the process for
 it. The picture comes with `fg`.

@@ -35,7 +35,7 @@ def entry_points(group: str) -> tuple[EntryPoint, ...]:
     def declared(package: Distribution) -> list[EntryPoint]:
         try:
             points = [point for point in package.entry_points if point.group == group]
-        except (OSError, TypeError, ValueError):  # metadata of another package that nobody can read
+        except (OSError, TypeError, ValueError):  # metadata of another package that cannot be read
             return []
         label = f"{package.name} {package.version}" if points else ""  # read only where there are some
         return [EntryPoint(point.name, point.value.partition("[")[0].strip(), label) for point in points]

@@ -1,4 +1,4 @@
-"""How work that takes long reports how far it is, without knowing who shows it (`report.progress` does)."""
+"""How work that takes long reports how far it is, without knowing what shows it (`report.progress` does)."""
 
 from collections.abc import Callable
 

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterable, Iterator
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Final, assert_never
+from typing import Annotated, Final, TypeVar, assert_never
 
 import msgspec
 
@@ -17,6 +17,8 @@ from aftbed.core.input_file import read_input
 from aftbed.judge.verdict import Word
 from aftbed.runtime.unix import control_client, run_directory
 from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
+
+Found = TypeVar("Found")
 
 VERDICT_NAME: Final = "verdict.json"  # in the record: the verdict of its command, as of --json
 FILE_BYTES_MAX: Final = 4_000_000
@@ -149,20 +151,22 @@ def _recorded(path: Path) -> ListedRun:
 
 def _about(path: Path) -> tuple[_About, float]:
     """With the time at which it was written."""
+    about = _decoded(path, _About)
     try:
-        return msgspec.json.decode(read_input(path, FILE_BYTES_MAX), type=_About), path.stat().st_mtime
+        return about, path.stat().st_mtime
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
-    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: {error}") from None
 
 
 def _verdict(path: Path) -> Word | None:
     """None where its command left none."""
+    return _decoded(path, _Judged).verdict if path.exists() else None
+
+
+def _decoded(path: Path, kind: type[Found]) -> Found:
+    """Raises ConfigError."""
     try:
-        return msgspec.json.decode(read_input(path, FILE_BYTES_MAX), type=_Judged).verdict
-    except FileNotFoundError:
-        return None
+        return msgspec.json.decode(read_input(path, FILE_BYTES_MAX), type=kind)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:

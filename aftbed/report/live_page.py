@@ -363,7 +363,7 @@ class PageServer(ThreadingHTTPServer):
 
 
 def _acquire_all(room: threading.Semaphore, count: int, seconds_max: float) -> None:
-    """Wait until nobody is in it."""
+    """Wait until all `count` places of `room` are free, for `seconds_max` at most."""
     limit_s = time.monotonic() + seconds_max
     for _ in range(count):
         room.acquire(timeout=max(0.0, limit_s - time.monotonic()))

@@ -92,7 +92,7 @@ def links(page: Path) -> list[str]:
 
 
 def images(page: Path) -> list[str]:
-    """The targets of all images; each has words for those who do not see it."""
+    """The targets of all images; each has words, for screen readers."""
     return _IMAGE.findall(prose(page))
 
 

@@ -90,7 +90,7 @@ def walk(home: Home, placement: str, todo: Iterable[Strike]) -> int:
     """Strike at each of `todo`, in runs of at most STRIKES_MAX; how many it survived. Prints the breaches.
 
     Nothing here hangs. Where an adaptation was refused for a replica that was taken for hung before the
-    strike, and nothing else is wrong, the strike is tried again in another run, FALSE_ALARMS_MAX times in all.
+    strike, and nothing else is wrong, it is tried again in another run, FALSE_ALARMS_MAX times in all.
     """
     left: dict[str, list[Strike]] = {}
     false_alarms = 0
