@@ -10,11 +10,14 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Final
 
 from aftbed.bench.rounds import ROUNDS, InRounds, beside_limit, in_turn
 from aftbed.bench.runs import Percentiles, endless_run, latencies_us, percentiles, wait_until_ready
 from aftbed.report import live_page
 from aftbed.runtime.unix.launch import listen_on_loopback
+
+SILENT_SECONDS_MAX: Final = 10.0  # of a page, which has something to say many times a second
 
 
 class PageResult(InRounds, frozen=True):
@@ -63,7 +66,7 @@ def reading(private: Path, read: list[int]) -> Iterator[None]:
     listener, token = listen_on_loopback(0, "--port"), live_page.new_token()
     host, port = listener.getsockname()
     with live_page.beside(listener, private, token):
-        line = http.client.HTTPConnection(host, port)
+        line = http.client.HTTPConnection(host, port, timeout=SILENT_SECONDS_MAX)
         line.request("GET", f"/stream?token={token}")
         stream = line.getresponse()
         snapshots = 1  # the first one, below
