@@ -38,7 +38,7 @@ from aftbed.core.errors import ConfigError, HarnessError, unknown
 from aftbed.core.progress import Show, unshown
 from aftbed.runtime.unix.interrupts import scratch_directory
 
-DEFAULT: Final = ("cycle --ftm pbr --requests 1100",)
+DEFAULT: Final = ("cycle --ftm pbr --count 1100",)
 VERSION_SECONDS_MAX: Final = 60.0
 QUANTILES: Final = ("p50", "p99", "")  # "": of a figure that is one number
 EXIT_TROUBLE: Final = 3  # of a bench that the machine was too busy for, perhaps

@@ -35,6 +35,7 @@ Placement = Annotated[str, typer.Option(metavar=choices(PLACEMENTS), help="Which
 Rounds = Annotated[
     int, typer.Option(min=1, help=f"Of figure and limit in turn; below {ROUNDS} they are too few to quote.")
 ]
+Count = Annotated[int, typer.Option(min=100, help="Requests after the warm-up.")]
 Pin = Annotated[bool, typer.Option(help="Keep each replica's chain on one core.")]
 
 
@@ -42,9 +43,9 @@ Pin = Annotated[bool, typer.Option(help="Keep each replica's chain on one core."
 def cycle(
     ftm: Ftm = "pbr",
     placement: Placement = "process",
-    requests: Annotated[int, typer.Option(min=100, help="After the warm-up.")] = REQUESTS_MIN,
+    count: Count = REQUESTS_MIN,
     app: App = None,
-    sent: Annotated[
+    requests: Annotated[
         str | None, typer.Option(help="What --app is sent: FILE (CSV, JSON lines) or MODULE:FUNCTION.")
     ] = None,
     pin: Pin = True,
@@ -53,13 +54,13 @@ def cycle(
 ) -> None:
     """Cycle time at the client, alternating with a bare ring of the same number of hops."""
     application, given = located(app) if app is not None else "", None
-    if sent is not None:
-        given = requests_from(located_requests(sent), SENT_FUNCTION, 0, OWN_CODE)
+    if requests is not None:
+        given = requests_from(located_requests(requests), SENT_FUNCTION, 0, OWN_CODE)
     with _measuring("cycle", as_json=json) as progress:
         result = bench_cycle(
             ftm,
             placement,
-            requests,
+            count,
             pin=pin,
             rounds=rounds,
             application=application,
@@ -172,7 +173,7 @@ def campaign(
 def simulator(
     ftm: Ftm = "pbr",
     placement: Placement = "process",
-    requests: Annotated[int, typer.Option(min=100, help="Over all rounds.")] = 22_000,
+    count: Annotated[int, typer.Option(min=100, help="Requests over all rounds.")] = 22_000,
     rounds: Rounds = ROUNDS,
     json: Json = False,
 ) -> None:
@@ -180,7 +181,7 @@ def simulator(
     from aftbed.bench.simulator import bench_simulator  # noqa: PLC0415 - see above
 
     with _measuring("simulator", as_json=json) as progress:
-        found = bench_simulator(ftm, placement, requests, rounds=rounds, show=progress.show)
+        found = bench_simulator(ftm, placement, count, rounds=rounds, show=progress.show)
     _print(found, as_json=json)
 
 
@@ -209,13 +210,13 @@ def state(
 @bench.command()
 def hops(
     ftm: Ftm = "pbr",
-    requests: Annotated[int, typer.Option(min=100, help="After the warm-up.")] = REQUESTS_MIN,
+    count: Count = REQUESTS_MIN,
     pin: Pin = True,
     json: Json = False,
 ) -> None:
     """The delay of one hop between two bricks in processes of their own, as a distribution."""
     with _measuring("hops", as_json=json):
-        found = bench_hops(ftm, requests, pin=pin)
+        found = bench_hops(ftm, count, pin=pin)
     if json:
         _print(found, as_json=True)
         return

@@ -76,7 +76,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = {
     "explore crash": ("explore crash --ftm pbr --placement replica",),
     "explore adapt": ("explore adapt --ftm pbr,lfr",),
     "explore pairs": ("explore pairs --ftm pbr --only 17",),
-    "explore order": ("explore order --ftm pbr --requests 2",),
+    "explore order": ("explore order --ftm pbr --count 2",),
     "campaign list": ("campaign list",),
     "campaign schema": ("campaign schema",),
     "campaign plan": ("campaign plan bitflip --experiments 10",),

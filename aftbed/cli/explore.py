@@ -77,8 +77,10 @@ class NumberedArguments(ExploreArguments, frozen=True, kw_only=True):
     only: Annotated[int | None, typer.Option(help="One experiment of this selection, by its number.")] = None
     app: App = None
     requests: Annotated[
-        str | None,
-        typer.Option(help="crash: how many a run has (3). Or what is sent: FILE, or MODULE:FUNCTION."),
+        str | None, typer.Option(help="What --app is sent: FILE (CSV, JSON lines) or MODULE:FUNCTION.")
+    ] = None
+    count: Annotated[
+        int | None, typer.Option(help="crash: requests of a run; 3, or all of a file, if left out.")
     ] = None
     force: Annotated[
         bool, typer.Option("--force", help="Explore --app even where a mechanism does not suit it.")
@@ -88,9 +90,9 @@ class NumberedArguments(ExploreArguments, frozen=True, kw_only=True):
 class ExploreOrderArguments(ExploreArguments, frozen=True, kw_only=True):
     """The options of `aftbed explore order`."""
 
-    requests: Annotated[
-        int, typer.Option(help="Requests of an undisturbed run, at most; one with a crash.")
-    ] = ORDER_REQUESTS
+    count: Annotated[int, typer.Option(help="Requests of an undisturbed run, at most; one with a crash.")] = (
+        ORDER_REQUESTS
+    )
     bound: Annotated[int, typer.Option(help="Runs of one experiment, at most.")] = BOUND
 
 
@@ -124,17 +126,15 @@ def pairs(given: NumberedArguments) -> int:
 def _selection(explorer: str, given: NumberedArguments) -> Selection:
     """What of all there is was asked for. Raises ConfigError."""
     text, sent, counted = given.requests, None, explorer == "crash"
-    count = REQUESTS if counted else 0
-    if text is not None and text.removeprefix("-").isdecimal():
+    if given.count is not None:
         if not counted:
-            raise ConfigError(f"--requests {text}: how many a run has is the explorer's; FILE is allowed")
-        count = int(text)
-    elif text is not None:
-        whole = None if not names_function(text) else max(count, FUNCTION_REQUESTS)
-        source = RequestSource(text, count=whole, count_max=REQUESTS_MAX, expect=None, tolerance=None)
+            raise ConfigError(f"--count {given.count}: {explorer} itself decides how many requests a run has")
+        check_range("--count", given.count, 1, REQUESTS_MAX)
+    count = (REQUESTS if given.count is None else given.count) if counted else 0
+    if text is not None:
+        asked = FUNCTION_REQUESTS if given.count is None and names_function(text) else given.count
+        source = RequestSource(text, count=asked, count_max=REQUESTS_MAX, expect=None, tolerance=None)
         sent, count = source.of(0), source.count if counted else 0
-    if counted:
-        check_range("--requests", count, 1, REQUESTS_MAX)
     chosen = selected(explorer, separated(given.ftm), separated(given.placement), count)
     application = located(given.app) if given.app is not None else ""
     if application:
@@ -212,10 +212,8 @@ def _explore_one(selection: Selection, setups: list[Setup], number: int, *, as_j
 
 def _command(selection: Selection, only: int) -> str:
     """The command that runs one experiment of `selection` again."""
-    if selection.given is not None:
-        requests = f" --requests {shlex.quote(selection.given.source)}"
-    else:
-        requests = f" --requests {selection.requests}" if selection.requests else ""
+    requests = f" --requests {shlex.quote(selection.given.source)}" if selection.given is not None else ""
+    requests += f" --count {selection.requests}" if selection.requests else ""
     requests += f" --app {shlex.quote(selection.application)}" if selection.application else ""
     ftms, placements = ",".join(selection.ftms), ",".join(selection.placements)
     where = "" if selection.placements == PLACEMENTS else f" --placement {placements}"
@@ -259,11 +257,11 @@ def _since(began_s: float) -> float:
 def order(given: ExploreOrderArguments) -> int:
     """Every order in which messages can arrive, without those that make no difference."""
     jobs, began_s, found = jobs_of(given.jobs), time.monotonic(), list[OrderedRuns]()
-    check_range("--requests", given.requests, 1, REQUESTS_MAX)
+    check_range("--count", given.count, 1, REQUESTS_MAX)
     check_range("--bound", given.bound, 1, BOUND_MAX)
     # The same mechanisms as those of `crash`.
-    chosen = selected("crash", separated(given.ftm), separated(given.placement), given.requests)
-    setups = list(experiments(chosen.ftms, chosen.placements, given.requests))
+    chosen = selected("crash", separated(given.ftm), separated(given.placement), given.count)
+    setups = list(experiments(chosen.ftms, chosen.placements, given.count))
     stopped = False
     try:
         with ProgressLine("explore order", len(setups), "experiments", plain=not given.json) as progress:

@@ -9,6 +9,7 @@ import typer
 from aftbed.cli.interrupted import told_if_interrupted
 from aftbed.cli.options import Json, print_json
 from aftbed.core.errors import ConfigError, shown
+from aftbed.core.units import milliseconds
 from aftbed.interop.openscenario.document import CAUSES, Cause
 from aftbed.interop.openscenario.folder import FileReport, import_folder
 from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, import_scenario, write
@@ -43,8 +44,7 @@ def import_(
         typer.Option(metavar="<stop|no_collision|no_braking>", help="The outcome that each drive must have."),
     ] = "no_collision",
     duration: Annotated[
-        float | None,
-        typer.Option(metavar="SECONDS", help="Length of a drive; default: its StopTrigger, or 30."),
+        str | None, typer.Option(help="Length of a drive, as 40s; default: its StopTrigger, or 30s.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of a stochastic distribution that has no randomSeed.")] = 0,
     force: Annotated[bool, typer.Option("--force", help="Overwrite files that differ.")] = False,
@@ -54,7 +54,8 @@ def import_(
 
     Exit code: 0 imported, 2 refused; for a DIR 2 if no file of it can be imported.
     """
-    options = ImportOptions(ego, expect, duration, tuple(_picked(one) for one in pick or ()), seed)
+    seconds = milliseconds("--duration", duration) / 1000 if duration is not None else None
+    options = ImportOptions(ego, expect, seconds, tuple(_picked(one) for one in pick or ()), seed)
     if file.is_dir():
         if variations is not None or pick:
             option = "--pick" if pick else "--variations"

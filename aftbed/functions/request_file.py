@@ -472,6 +472,10 @@ def located_requests(source: str, folder: Path | None = None) -> str:
             return source
     path = (here / place).resolve()
     if not path.exists():  # what else is wrong with it, its reader says
+        if source.isdecimal():
+            raise ConfigError(
+                f"--requests {source}: a file or MODULE:FUNCTION; how many is '--count {source}'"
+            )
         raise ConfigError(f"{source}: {path}: no such file")
     return f"{path}:{name}" if name else str(path)
 

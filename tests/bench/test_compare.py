@@ -293,7 +293,7 @@ def test_this_version_beside_itself(home: Home, tmp_path: Path) -> None:
     for place in places:
         venv.create(place, with_pip=False)
         (next((place / "lib").glob("python3*")) / "site-packages" / "aftbed.pth").write_text("\n".join(paths))
-    bench = "cycle --requests 100 --rounds 1"
+    bench = "cycle --count 100 --rounds 1"
     done = aftbed("bench", "compare", *places, "--bench", bench, "--rounds", "1", "--json")
     assert done.code == 0, done.err
     found = msgspec.json.decode(done.out, type=compare.VersionComparison)

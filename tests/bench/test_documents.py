@@ -39,7 +39,7 @@ def check_beside(found: dict[str, Any], name: str, rounds: int) -> None:
 
 
 def test_a_cycle(home: Home) -> None:
-    found = document("cycle", "--requests", "101", "--rounds", "2", "--placement", "replica")
+    found = document("cycle", "--count", "101", "--rounds", "2", "--placement", "replica")
     check_beside(found, "bare ring of 4 hops and 1 to the backup", 2)
     assert (found["requests"], found["hops"], len(found["ratio_rounds"])) == (101, 4, 2)
     assert (

@@ -90,7 +90,7 @@ def test_the_nearest_rank() -> None:
 @pytest.mark.process
 @pytest.mark.parametrize("ftm", ["pbr", "lfr+tr"])
 def test_the_document(home: Home, ftm: str) -> None:
-    done = aftbed("bench", "hops", "--ftm", ftm, "--requests", str(REQUESTS), "--json")
+    done = aftbed("bench", "hops", "--ftm", ftm, "--count", str(REQUESTS), "--json")
     assert done.code == 0, done.out + done.err
     found = json.loads(done.out)
     assert [(p["source"], p["sink"]) for p in found["pairs"]] == named(pairs(ftm))
@@ -113,7 +113,7 @@ def test_the_document(home: Home, ftm: str) -> None:
 
 @pytest.mark.process
 def test_what_a_person_reads(home: Home) -> None:
-    done = aftbed("bench", "hops", "--requests", str(REQUESTS))
+    done = aftbed("bench", "hops", "--count", str(REQUESTS))
     assert done.code == 0, done.out + done.err
     lines = done.out.splitlines()
     assert lines[0].split() == ["ftm", "pbr"]

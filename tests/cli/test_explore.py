@@ -19,7 +19,7 @@ from aftbed.search.explore import EXPLORERS, PLACEMENTS, selected
 pytestmark = pytest.mark.simulation
 
 ORDER: Final = ("order", "--ftm", "lfr", "--placement", "replica")
-SMALL: Final = ("crash", "--ftm", "lfr", "--placement", "replica", "--requests", "1")
+SMALL: Final = ("crash", "--ftm", "lfr", "--placement", "replica", "--count", "1")
 
 
 @pytest.fixture
@@ -110,7 +110,7 @@ def test_one_process_and_two_count_the_same(explore: Call) -> None:
 
 
 def test_names_are_separated_by_commas_or_given_one_by_one(explore: Call) -> None:
-    small = ("crash", "--placement", "replica", "--requests", "1", "--jobs", "1", "--json")
+    small = ("crash", "--placement", "replica", "--count", "1", "--jobs", "1", "--json")
     together, apart = (
         json.loads(explore(*small, *ftms)[1])["explored"]
         for ftms in (("--ftm", "pbr,lfr"), ("--ftm", "pbr", "--ftm", "lfr"))
@@ -147,7 +147,7 @@ def test_of_many_broken_experiments_the_first_are_printed_and_json_has_all(
     first = document["broken"][0]
     assert first["number"] == 0 and first["breaches"] == ["G1: planted"]
     assert first["command"].startswith(
-        "aftbed explore crash --ftm lfr --placement replica --requests 1 --only 0"
+        "aftbed explore crash --ftm lfr --placement replica --count 1 --only 0"
     )
 
 
@@ -187,7 +187,7 @@ def test_adaptations_from_and_to_a_mechanism_of_one_replica(explore: Call) -> No
 
 
 def test_every_order_is_counted_up_to_the_bound(explore: Call) -> None:
-    code, out, _ = explore(*ORDER, "--requests", "2", "--bound", "20")
+    code, out, _ = explore(*ORDER, "--count", "2", "--bound", "20")
     lines = out.splitlines()
     assert code == 0
     assert lines[0] == "all 2 orders (3 cut): lfr (replica), seed 0, 1 request; pages of 16 bytes"
@@ -197,7 +197,7 @@ def test_every_order_is_counted_up_to_the_bound(explore: Call) -> None:
 
 
 def test_the_orders_as_json(explore: Call) -> None:
-    code, out, _ = explore(*ORDER, "--requests", "1", "--bound", "5", "--json")
+    code, out, _ = explore(*ORDER, "--count", "1", "--bound", "5", "--json")
     found = json.loads(out)
     assert code == 0 and found["explored"] == found["survived"] > 0
     assert (found["bound"], found["complete"], found["broken"]) == (5, 1, [])
@@ -209,8 +209,8 @@ def test_the_orders_as_json(explore: Call) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("crash", "--requests", "0"), ("--requests 0", "1 to 1000")),
-        (("crash", "--requests", "-3"), ("--requests -3",)),
+        (("crash", "--count", "0"), ("--count 0", "1 to 1000")),
+        (("crash", "--count", "-3"), ("--count -3",)),
         (("crash", "--jobs", "0"), ("--jobs 0", "1 to 256")),
         (("crash", "--ftm", "prb"), ("unknown FTM 'prb'", "did you mean 'pbr'")),
         (("crash", "--ftm", "pbr,"), ("unknown FTM ''",)),
@@ -221,7 +221,7 @@ def test_the_orders_as_json(explore: Call) -> None:
         ((*SMALL, "--only", "99999"), ("--only 99999", "0 to ")),
         ((*SMALL, "--only", "-1"), ("--only -1",)),
         ((*ORDER, "--bound", "0"), ("--bound 0: 1 to 10000000 are allowed",)),
-        ((*ORDER, "--requests", "0"), ("--requests 0: 1 to 1000 are allowed",)),
+        ((*ORDER, "--count", "0"), ("--count 0: 1 to 1000 are allowed",)),
         (("order", "--ftm", "lfrr"), ("unknown FTM 'lfrr'",)),
     ],
 )
@@ -248,7 +248,7 @@ class Interrupted:
 def test_ctrl_c_ends_every_explorer_with_130(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, command in (("explore_all", "crash"), ("explore_orders", "order")):
         monkeypatch.setattr(f"aftbed.cli.explore.{name}", lambda *_, **__: Interrupted())
-        words = ("explore", command, "--ftm", "pbr", "--placement", "process", "--requests", "1")
+        words = ("explore", command, "--ftm", "pbr", "--placement", "process", "--count", "1")
         code, out, err = call(*words)
         assert code == 130 and err.startswith("aftbed: interrupted: 0 of ") and "nothing is kept" in err
         assert out.splitlines()[-1].startswith("0 of 0 ")

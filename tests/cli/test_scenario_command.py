@@ -238,7 +238,7 @@ def test_one_document_for_many_variations(output: Output, tmp_path: Path) -> Non
 
 
 def test_an_entry_of_a_catalog_is_printed_with_its_file(output: Output) -> None:
-    out = output("scenario", "import", SLOW_LEAD, "--ego", "Host", "--duration", "9")
+    out = output("scenario", "import", SLOW_LEAD, "--ego", "Host", "--duration", "9s")
     assert f"({FOLDER / 'catalogs' / 'cars.xosc'})" in out
     assert "ObjectController           aftbed's function takes its place" in out
     assert load_scenario("./slow_lead.yaml").duration_ms == 9000
@@ -258,7 +258,10 @@ def test_an_entry_of_a_catalog_is_printed_with_its_file(output: Output) -> None:
         ([FOLDER, "--pick", "Gap=12"], "--pick: is for one file"),
         ([LEAD_BRAKES, "--ego", "Bert"], "--ego: unknown vehicle 'Bert' (one of: Ego, Lead)"),
         ([LEAD_BRAKES, "--expect", "crash"], "--expect: unknown outcome 'crash'"),
-        ([LEAD_BRAKES, "--duration", "0"], "--duration: found 0, allowed is more than 0 and at most 3600"),
+        (
+            [LEAD_BRAKES, "--duration", "9"],
+            "--duration '9': a positive number with its unit is allowed, as 50ms or 2s",
+        ),
         ([LEAD_BRAKES, "--variations", LEAD_BRAKES], "no ParameterValueDistribution in it"),
         ([LEAD_BRAKES, "--out", LEAD_BRAKES], "cannot be written: "),
         (["nowhere.xosc"], "nowhere.xosc: cannot be read: No such file or directory"),

@@ -147,7 +147,7 @@ def test_it_is_adapted_to_and_from(project: Path) -> None:
 
 
 def test_it_is_explored(project: Path) -> None:
-    chosen = ("--ftm", "lfr+limit", "--placement", "replica", "--requests", "1", "--jobs", "1", "--json")
+    chosen = ("--ftm", "lfr+limit", "--placement", "replica", "--count", "1", "--jobs", "1", "--json")
     found = json.loads(run(project, "explore", "crash", *chosen))
     assert found["explored"] > 50 and found["survived"] == found["explored"]
 

@@ -229,13 +229,13 @@ def test_the_cycle_of_a_function_is_measured_with_its_requests(library: str, tmp
     words = (
         "bench",
         "cycle",
-        "--requests",
+        "--count",
         "100",
         "--rounds",
         "2",
         "--app",
         library,
-        "--sent",
+        "--requests",
         tmp_path / "sent.csv",
         "--json",
     )
