@@ -68,7 +68,7 @@ COMMAND_BYTES_MAX: Final = 1000
 SEND_S_MAX: Final = 5.0  # that a browser may take to read, or to send its request
 EVENTS_KEPT: Final = 500
 READ_BYTES_MAX: Final = 1_000_000  # of a log, at once
-NICE: Final = 10
+NICE: Final = 19
 TOKEN_VARIABLE: Final = "AFTBED_PAGE_TOKEN"  # not an argument: other users can read those
 POLICY: Final = (
     "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; connect-src 'self';"
@@ -496,7 +496,7 @@ def beside(listener: socket.socket, private: Path, token: str) -> Iterator[None]
 
 def serve(listener: socket.socket, private: Path, token: str, *, starting: bool = False) -> None:
     """Serve the page of the run in `private` until it has ended. `starting`: it may not be there yet."""
-    os.nice(NICE)
+    linux.yield_cpu(NICE)
     PageServer(listener, private, token).serve_until_the_end(starting=starting)
 
 

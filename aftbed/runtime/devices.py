@@ -186,8 +186,8 @@ class CarDevice(Device):
         self._payloads: deque[bytes] = deque()
         self._overrun = 0
         self._quiet = False
-        self._sent_ns = 0
-        self._cycle_us = 0.0  # of the last request
+        self._sent_ns: dict[int, int] = {}  # of those that are not answered, by request
+        self._cycle_us = self._slowest_us = 0.0  # of the last request; of those since `stats` was asked for
 
     def fds(self) -> tuple[int, ...]:
         return self.link.fds()
@@ -210,7 +210,9 @@ class CarDevice(Device):
         payload = self._payloads.popleft()
         self._dialogue.keep(now_ns, self._client.capture)
         self._dialogue.write(now_ns, self._client.next_id, 0, _SENT, payload)
-        self._sent_ns = now_ns
+        if len(self._sent_ns) >= BACKLOG_MAX:  # the oldest has been given up
+            del self._sent_ns[next(iter(self._sent_ns))]
+        self._sent_ns[self._client.next_id] = now_ns
         return Submit(payload)
 
     def wait(self, now_ns: int) -> None:
@@ -218,7 +220,10 @@ class CarDevice(Device):
 
     def accept(self, reply: Reply, now_ns: int) -> None:
         """Send the reply to the brakes, then write it: a reply lost in between is requested again."""
-        self._cycle_us = round((now_ns - self._sent_ns) / 1e3, 1)
+        sent_ns = self._sent_ns.pop(reply.request_id, None)
+        if sent_ns is not None:  # not by the predecessor of this node
+            self._cycle_us = round((now_ns - sent_ns) / 1e3, 1)
+            self._slowest_us = max(self._slowest_us, self._cycle_us)
         self.link.deliver(reply, now_ns)
         self._dialogue.write(now_ns, reply.request_id, reply.epoch, _ANSWERED, reply.payload)
 
@@ -242,7 +247,9 @@ class CarDevice(Device):
             "unanswered": waiting + len(self._payloads),  # with those that wait to be sent
             "overrun": self._overrun,
             "cycle_us": self._cycle_us,
+            "slowest_us": self._slowest_us,
         }
+        self._slowest_us = 0.0
         return msgspec.msgpack.encode(counts | self.link.counts())
 
 

@@ -111,6 +111,8 @@ def test_it_shows_a_crash_and_a_composition_that_its_buttons_asked_for(home: Hom
             page.until("document.getElementById('answer').textContent.includes('pbr to pbr+tr: done')")
             page.until("!!document.querySelector('[data-node=\"a/tr.after\"]')")
             page.until("document.querySelector('[data-fact=\"last blackout\"]').textContent.endsWith(' ms')")
+            page.value("document.querySelector('[data-words=\"inject hang primary\"]').click()")
+            page.until("parseFloat(document.querySelector('[data-fact=\"slowest reply\"]').textContent) > 5")
             for width, dark in ((1280, False), (420, True)):
                 page.look(tmp_path / f"page{width}.png", width, dark=dark)
                 assert page.value("document.documentElement.scrollWidth <= innerWidth"), width
@@ -121,6 +123,22 @@ def test_it_shows_a_crash_and_a_composition_that_its_buttons_asked_for(home: Hom
     assert done.code == 0, done.out + done.err
     assert "crash primary: activated" in done.out
     assert "at the end pbr+tr" in done.out
+
+
+@needs_browser
+def test_of_a_replay_it_shows_what_the_function_sees(
+    home: Home, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert aftbed("init", "map", "mine").code == 0
+    log = ("--replay", "mine.log", "--dbc", "ars408-like", "--map", "mine.yaml", "--loop")
+    with Command(*log, "--web") as command, driven(tmp_path) as page:
+        page.open(address(command))
+        page.until("document.getElementById('road').textContent.includes('km/h, demand: ')")
+        page.until("document.getElementById('plots').textContent.includes('gap (m)')")
+        page.look(tmp_path / "replay.png")
+        assert aftbed("stop").code == 0
+        assert command.done().code == 0
 
 
 def test_who_must_not_get_it_is_refused_and_changes_nothing(run: Command) -> None:

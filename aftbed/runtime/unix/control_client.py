@@ -69,7 +69,8 @@ class StopCommand(msgspec.Struct, frozen=True, tag=True):
 class Status(ServiceState, frozen=True, kw_only=True):
     """The answer to a StatusQuery.
 
-    `vehicle` is the latest of a drive, `sees` that of a replay; `busy` names tasks of the executive.
+    `slowest_us` is the longest cycle of the last 2 s. `vehicle` is the latest of a drive, `sees` that of a
+    replay; `busy` names tasks of the executive.
     """
 
     run: str
@@ -78,6 +79,7 @@ class Status(ServiceState, frozen=True, kw_only=True):
     seconds: float
     busy: list[str]
     record: str
+    slowest_us: float | None
     port: int
     bitrate_bps: int | None
     vehicle: Telemetry | None

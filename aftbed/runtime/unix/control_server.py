@@ -159,6 +159,7 @@ class ControlServer:
             seconds=round((time.monotonic_ns() - self._started_ns) / 1e9, 2),
             busy=self._loop.tasks.names(),
             record=options.record,
+            slowest_us=work.slowest_us,
             port=options.port,
             bitrate_bps=getattr(options.work, "bitrate_bps", None),
             vehicle=work.telemetry,

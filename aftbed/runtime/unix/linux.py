@@ -133,6 +133,18 @@ def use_batch_scheduling() -> None:
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
+def yield_cpu(nice: int) -> None:
+    """Run at `nice`, which the kernel counts against the processes of the same session, where it groups them
+    by session (sched(7), "The autogroup feature"); against all others too, if this process leads its session.
+    """
+    os.nice(nice)
+    if os.getsid(0) == os.getpid():
+        with contextlib.suppress(
+            OSError
+        ):  # no groups, or changed too often just now
+            Path("/proc/self/autogroup").write_text(str(nice))
+
+
 def package_environment() -> dict[str, str]:
     """An environment in which an interpreter finds this very package."""
     home, environment = str(Path(__file__).resolve().parents[3]), dict(os.environ)

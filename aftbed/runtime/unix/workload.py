@@ -11,6 +11,7 @@ import os
 import secrets
 import socket
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
@@ -37,6 +38,8 @@ from aftbed.vehicle.plant import Telemetry
 ATTACH_SECONDS_MAX: Final = 10.0
 LOAD_POLL_SECONDS: Final = (0.02, 0.5)  # between two questions how far a load has come: at least, at most
 STALL_SECONDS_MAX: Final = 3.0  # a recovery takes milliseconds, a loss is seen after half a second
+SLOWEST_SECONDS: Final = 2.0
+SLOWEST_MAX: Final = 100  # the Client is asked no more often than `LOAD_POLL_SECONDS`
 CYCLE_EVERY: Final = 10  # reports of the car, after which requests are counted
 VEHICLE: Final = "vehicle"
 SECRET_BYTES: Final = 16
@@ -146,7 +149,7 @@ class Workload:
         report_owner: Callable[[str, bytes], None],
         counted: Callable[[], None],
     ) -> None:
-        """`report_owner`: a report to the command; `counted`: `requests` and `cycle_us` are new."""
+        """`report_owner`: a report to the command; `counted`: what the client has counted is new."""
         self._options, self._pool, self._loop = options, pool, loop
         self._log, self._finish, self._report_owner, self._counted = log, finish, report_owner, counted
         self._is_load = isinstance(options.work, LoadRun)
@@ -157,6 +160,7 @@ class Workload:
         self.bus = CarFaults(pool, loop.tasks.settle, log)
         self._result: object = None
         self._stats: dict[str, object] = {}
+        self._slowest: deque[tuple[int, float]] = deque(maxlen=SLOWEST_MAX)  # when it was told, and in us
         self.telemetry: Telemetry | None = None  # of a drive
         self.sight: Sight | None = None  # of a replay
         self.ended, self.awaits_replies = False, True
@@ -296,6 +300,17 @@ class Workload:
         cycle_us = self._stats.get("cycle_us")
         return cycle_us if isinstance(cycle_us, float | int) else None
 
+    @property
+    def slowest_us(self) -> float | None:
+        """The longest cycle of the last seconds, such as of a request that waited for a failover.
+
+        The Client tells the longest since it was asked before; this is the longest of `SLOWEST_SECONDS`.
+        """
+        since_ns = time.monotonic_ns() - round(SLOWEST_SECONDS * 1e9)
+        while self._slowest and self._slowest[0][0] < since_ns:
+            self._slowest.popleft()
+        return max((us for _, us in self._slowest), default=None)
+
     def _poll_load(self) -> None:
         """Watch the load again when it can be over; now and then, in case nothing moves any more."""
         work, sent, (pause, longest) = self._options.work, self._stats.get("sent"), LOAD_POLL_SECONDS
@@ -325,6 +340,8 @@ class Workload:
     def _ask_stats(self) -> Keys:
         data = yield from self.deployment.ask("client", control.Stats)
         self._stats = msgspec.msgpack.decode(data)
+        if isinstance(slowest_us := self._stats.get("slowest_us"), float) and slowest_us > 0:
+            self._slowest.append((time.monotonic_ns(), slowest_us))
 
     # -- the end ------------------------------------------------------------------------------
 
