@@ -212,7 +212,7 @@ def before(one: Scheduled, other: Scheduled) -> bool:
 def plan_goal(graph: Graph, goal: Goal) -> Plan:
     """The plan that leads from `graph` to `goal`. Raises ConfigError, with all that is wrong in a script."""
     if goal.script is not None:
-        found = refusals(graph, goal.script)
+        found = [str(refusal) for refusal in refusals(graph, goal.script)]
         if found and not goal.file:
             raise ScriptError(f"the script {goal.script.purpose!r} is refused: {'; '.join(found)}")
         refuse(goal.file, found)

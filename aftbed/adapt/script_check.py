@@ -17,7 +17,7 @@ places, and a rule that is written later has them too.
 
 from collections.abc import Callable, Iterator
 from functools import cache
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -62,8 +62,18 @@ _OF_NODES: Final = (Migrate, Exchange, Retire, Destroy)
 Rule = Callable[[Script], list[str]]
 
 
-def refusals(graph: Graph, script: Script) -> list[str]:
-    """Every reason to refuse `script` where `graph` runs, with its place; [] if it may be carried out."""
+class StepRefusal(NamedTuple):
+    """Why a script is refused, and the step that it is about, as `commit[3]`; "": the whole script."""
+
+    place: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.place}: {self.reason}" if self.place else self.reason
+
+
+def refusals(graph: Graph, script: Script) -> list[StepRefusal]:
+    """Every reason to refuse `script` where `graph` runs; [] if it may be carried out."""
     found = list(dict.fromkeys(_strangers(graph, script)))
     looks: tuple[tuple[Rule, ...], ...] = (
         (problems, lambda s: _forms(graph, s)),
@@ -85,8 +95,8 @@ def _steps(script: Script) -> Iterator[tuple[str, Step]]:
             yield f"{phase}[{index}]", verb
 
 
-def _strangers(graph: Graph, script: Script) -> Iterator[str]:
-    """Names that are neither in the graph nor staged, with their places."""
+def _strangers(graph: Graph, script: Script) -> Iterator[StepRefusal]:
+    """Names that are neither in the graph nor staged."""
     staged = [v for v in flat((*script.prepare, *script.commit)) if isinstance(v, Stage)]
     bricks = {b.name for b in graph.bricks} | {b.name for v in staged for b in v.bricks}
     for place, step in _steps(script):
@@ -95,10 +105,10 @@ def _strangers(graph: Graph, script: Script) -> Iterator[str]:
                 continue
             is_node = isinstance(verb, _OF_NODES)
             allowed = set(graph.nodes) if is_node else bricks
-            here = f"{place}: {type(verb).__name__.lower()}"
             for name in names(verb):
                 if name not in allowed:
-                    yield f"{here}: {unknown('node' if is_node else 'brick', name, allowed)}"
+                    wrong = unknown("node" if is_node else "brick", name, allowed)
+                    yield StepRefusal(place, f"{type(verb).__name__.lower()}: {wrong}")
 
 
 # -- by itself ------------------------------------------------------------------------------------
@@ -357,7 +367,7 @@ def _states(graph: Graph, script: Script) -> list[str]:
 # -- which step -----------------------------------------------------------------------------------
 
 
-def _placed(script: Script, rule: Rule) -> list[str]:
+def _placed(script: Script, rule: Rule) -> list[StepRefusal]:
     """What `rule` finds, each with the step since which it is there."""
     reasons = list(dict.fromkeys(rule(script)))
     steps, places = list(_steps(script)), dict[str, str]()
@@ -370,5 +380,5 @@ def _placed(script: Script, rule: Rule) -> list[str]:
             beginning[phase] = verbs[:rest]
             rest -= len(beginning[phase])
         before = rule(msgspec.structs.replace(script, **beginning))
-        places |= {reason: f"{steps[count][0]}: " for reason in left if reason not in before}
-    return [places.get(reason, "") + reason for reason in reasons]
+        places |= {reason: steps[count][0] for reason in left if reason not in before}
+    return [StepRefusal(places.get(reason, ""), reason) for reason in reasons]

@@ -19,7 +19,8 @@ from aftbed.adapt import commands
 from aftbed.adapt.commands import Wish, goal_of
 from aftbed.adapt.planner import APPLICATION, Plan, target
 from aftbed.adapt.planner import plan as plan_between
-from aftbed.adapt.script_file import ScriptFile, entry, mapping, phases, script_from
+from aftbed.adapt.script_check import refusals
+from aftbed.adapt.script_file import ScriptFile, entry, mapping, phases, refuse, script_from
 from aftbed.adapt.suitability import remarks, unsuitable
 from aftbed.cli.options import Json, Recipe, Run, choices, class_source, print_json, takes
 from aftbed.cli.parsing import PlainGroup
@@ -124,9 +125,13 @@ def script(
     """Carry out a script from a file; all of it is checked before its first step."""
     path = Path(file)
     found = script_from(read_yaml(path, ScriptFile), file, partial(position, path))
-    wanted = _absolute(found, path.parent)
+    wanted, private = _absolute(found, path.parent), run_directory.find(run)
+    graph = msgspec.convert(control_client.ask(private, control_client.GraphQuery()), Graph)
+    # As the run itself does, which does not know the lines of the file.
+    wrong = refusals(graph, wanted)
+    refuse(file, [f"{position(path, one.place) if one.place else ''}{one}" for one in wrong])
     goal = Goal(script=wanted, recipe=wanted.recipe, file=file, may_fail=may_fail)
-    raise typer.Exit(_ask(run_directory.find(run), goal, as_json=json))
+    raise typer.Exit(_ask(private, goal, as_json=json))
 
 
 def _change(wish: Wish, given: ChangeArguments) -> int:

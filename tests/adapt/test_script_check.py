@@ -90,7 +90,7 @@ def test_the_scripts_of_these_tests_are_good_before_they_are_spoilt() -> None:
     ],
 )
 def test_names_that_do_not_exist(bad: Script, reason: str) -> None:
-    (found,) = refusals(PBR, bad)
+    (found,) = map(str, refusals(PBR, bad))
     assert found.startswith(reason)
 
 
@@ -126,7 +126,7 @@ def test_names_that_do_not_exist(bad: Script, reason: str) -> None:
     ],
 )
 def test_what_a_script_may_not_do(bad: Script, reason: str) -> None:
-    assert any(found.startswith(reason) for found in refusals(PBR, bad)), refusals(PBR, bad)
+    assert any(str(found).startswith(reason) for found in refusals(PBR, bad)), refusals(PBR, bad)
 
 
 @pytest.mark.parametrize(
@@ -168,7 +168,7 @@ def test_what_a_script_may_not_do(bad: Script, reason: str) -> None:
     ],
 )
 def test_a_graph_that_cannot_run(bad: Script, reason: str) -> None:
-    assert any(found.startswith(reason) for found in refusals(PBR, bad)), refusals(PBR, bad)
+    assert any(str(found).startswith(reason) for found in refusals(PBR, bad)), refusals(PBR, bad)
 
 
 def together_without(script: Script, at: int, verb: Step) -> Script:
@@ -214,7 +214,7 @@ def together_without(script: Script, at: int, verb: Step) -> Script:
     ],
 )
 def test_what_would_be_lost_on_the_way(bad: Script, reason: str) -> None:
-    assert any(reason in found for found in refusals(PBR, bad)), refusals(PBR, bad)
+    assert any(reason in str(found) for found in refusals(PBR, bad)), refusals(PBR, bad)
 
 
 def test_to_resume_another_brick_does_not_let_requests_in() -> None:
@@ -225,12 +225,12 @@ def test_to_resume_another_brick_does_not_let_requests_in() -> None:
 def test_a_recipe_of_the_paper_is_for_one_brick_per_process() -> None:
     case = Case("pbr", "lfr", placement="replica").plan()
     paper = msgspec.structs.replace(case.script, recipe="paper")
-    assert "recipe paper is for placement process only, found replica" in refusals(case.old, paper)
+    assert "recipe paper is for placement process only, found replica" in map(str, refusals(case.old, paper))
 
 
 def test_every_problem_of_a_look_is_told_at_once() -> None:
     bad = finished(committed(COMPOSE, 1, Freeze("a/after"), Destroy("a/proceed")), Resume("b/after"))
-    assert [found.partition(": ")[0] for found in refusals(PBR, bad)] == [
+    assert [found.place for found in refusals(PBR, bad)] == [
         "commit[2]",
         "commit[1]",
         "finish[2]",

@@ -392,7 +392,9 @@ def test_a_script_that_does_not_fit_the_running_graph(fake: FakeRun, refused: Ou
     assert "unknown node 'a/before'" in refused("adapt", "script", lfr)
     fake.graph = build("pbr", "process").led_by("b")
     error = refused("adapt", "script", lfr)
-    assert "commit[2]: changed while b/protocol lets requests in: align a/server -> b/server" in error
+    line = 1 + lfr.read_text().splitlines().index("- align: a/server -> b/server")
+    place = f"line {line}, column 3: commit[2]"
+    assert f"{place}: changed while b/protocol lets requests in: align a/server -> b/server" in error
 
 
 @pytest.mark.parametrize("content", ["", "[]", "5", "\0", "commit: [", "purpose: x"])

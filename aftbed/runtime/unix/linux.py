@@ -139,9 +139,7 @@ def yield_cpu(nice: int) -> None:
     """
     os.nice(nice)
     if os.getsid(0) == os.getpid():
-        with contextlib.suppress(
-            OSError
-        ):  # no groups, or changed too often just now
+        with contextlib.suppress(OSError):  # no groups, or changed too often just now
             Path("/proc/self/autogroup").write_text(str(nice))
 
 
