@@ -283,10 +283,14 @@ def _judge(folder: Path, size: int, seconds: float, *, as_json: bool) -> int:
     from aftbed.campaign.summary import summarise  # noqa: PLC0415
     from aftbed.report.documents import documents  # noqa: PLC0415 - scipy
 
-    records = _ledger(folder)
-    summary = summarise(records, size, seconds)
-    for name, text in documents(summary, records).items():
-        write_text_whole(folder / name, text)
+    with ProgressLine("campaign", plain=False) as progress:
+        progress.step(f"reading {folder}")
+        records = _ledger(folder)
+        progress.step(f"judging {len(records.results)} experiments")
+        summary = summarise(records, size, seconds)
+        progress.step("writing the reports")
+        for name, text in documents(summary, records).items():
+            write_text_whole(folder / name, text)
     _show(summary, as_json=as_json)
     if not as_json:
         print(f"records and reports: {folder}")

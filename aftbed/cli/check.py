@@ -11,6 +11,7 @@ from aftbed.cli.options import Html, Json, Junit, Quiet, TrustedFolders, check_f
 from aftbed.cli.views import show_verdict
 from aftbed.judge.record import read_record
 from aftbed.judge.verdict import EXIT_CODES, Verdict, evidence_of, judge
+from aftbed.report.progress import ProgressLine
 from aftbed.runtime.unix.trust import Trust, trusting
 
 
@@ -25,7 +26,13 @@ def check(
     """Judge a recorded run again."""
     check_file("--junit", junit)
     check_file("--html", html)
-    verdict = judge_and_show(record, trusting(trust), as_json=json, quiet=quiet)
+    trusted = trusting(trust)
+    with ProgressLine("check", plain=False) as progress:
+        progress.step(f"reading {record}")
+        found = read_record(record)
+        progress.step(f"judging {record}")
+        verdict = judge(found, evidence_of(found, trust=trusted))
+    show_verdict(verdict, as_json=json, quiet=quiet)
     lines = write_junit(junit, verdict) if junit is not None else []
     lines += write_html(html, record, verdict) if html is not None else []
     if lines and not (json or quiet):

@@ -9,6 +9,7 @@ from msgspec.structs import asdict
 from aftbed.cli.options import Json, print_json
 from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError, shown
+from aftbed.report.progress import ProgressLine
 
 log = typer.Typer(cls=PlainGroup)
 
@@ -44,7 +45,8 @@ def convert(
     """Write a log of a CAN bus in another format."""
     from aftbed.interop.logs import convert as convert_log  # noqa: PLC0415 - imports python-can
 
-    done = convert_log(source, sink, from_format, to_format, dbc, skip_bad=skip_bad)
+    with ProgressLine("log convert", plain=False) as progress:
+        done = convert_log(source, sink, from_format, to_format, dbc, skip_bad=skip_bad, show=progress.step)
     if json:
         print_json({"file": str(sink)} | asdict(done))
         return
@@ -71,7 +73,11 @@ def export(
     if files == ExportFiles():
         raise ConfigError("nothing to write: give --mcap FILE, --trace FILE, or both")
     check(files)
-    written = write_files(read_record(record), files)
+    with ProgressLine("log export", plain=False) as progress:
+        progress.step(f"reading {record}")
+        found = read_record(record)
+        progress.step(f"writing the run of {record}")
+        written = write_files(found, files)
     if json:
         print_json({"files": written})
     else:

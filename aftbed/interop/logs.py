@@ -1009,8 +1009,12 @@ def convert(
     dbc: Path | None = None,
     *,
     skip_bad: bool = False,
+    show: Callable[[str], None] = lambda _: None,
 ) -> Conversion:
-    """Write the log `source` to `sink`. Raises ConfigError; then `sink` is as it was."""
+    """Write the log `source` to `sink`. Raises ConfigError; then `sink` is as it was.
+
+    `show` is told what is done next.
+    """
     read_as = format_of(source, from_format, "--from", tuple(READERS))
     write_as = format_of(sink, to_format, "--to", (*WRITERS, CSV))
     if dbc is not None and write_as != CSV:
@@ -1022,7 +1026,9 @@ def convert(
     codec = None
     if write_as == CSV:  # a DBC of the user may contradict itself: what lies within its messages is decoded
         codec = load_dbc() if dbc is None else load_dbc(find_dbc(str(dbc)), strict=False)
+    show(f"reading {source}")
     log = read_log(source, read_as, skip_bad=skip_bad)
+    show(f"writing {len(log.frames)} frames")
     if codec is not None:
         kept = write_whole(sink, lambda path: write_csv(log, codec, path))
     else:
