@@ -570,7 +570,7 @@ MUTANTS: Final = (
         f"{JUDGE}/execution.py",
         "    begun = _captured(function, 0)\n",
         '    begun = _did("capture", function.capture)\n',
-        UNIT,
+        PROCESS,
         ("tests/judge/test_trust.py",),
     ),
     SourceMutant(
