@@ -754,7 +754,7 @@ MUTANTS: Final = (
         "aftbed/vehicle/can/hub.py",
         "min(self._us_of(int(since_ns)), self.now_us())",
         "self.now_us()",
-        UNIT,
+        PROCESS,
         (
             "tests/vehicle/can/test_bus_faults.py::test_a_paced_notice_is_of_the_time_at_which_the_node_noticed",
         ),
