@@ -44,10 +44,11 @@ def test_a_stop_is_written_before_it_is_done_and_its_undo_behind_it(home: Home) 
             linux.started(pid),
         )
         assert began_ns + 60e6 <= stopped[0].due_ns <= time.monotonic_ns() + 60e6
-        # Where a busy machine makes the supervisor late, the warden has undone it before.
+        # Where a busy machine makes the supervisor late, the warden has undone it before. Where both are
+        # late, the node has been found to hang, and replaced.
         undone = [cleanup.Undone(pid, stopped[0].start, by) for by in ("supervisor", "warden")]
         until(lambda: any(one in entries(run)[1:] for one in undone), "the undo")
-        assert state_of(pid) not in ("T", "")
+        assert state_of(pid) != "T"
         assert run.stop().verdict.verdict == "pass"
 
 
