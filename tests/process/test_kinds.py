@@ -1,4 +1,4 @@
-"""Each kind of function, and a crash at every event of a request, in real runs: half an hour."""
+"""Each kind of function, and a crash at every event of a request, in real runs: more than an hour."""
 
 import json
 import subprocess

@@ -112,6 +112,7 @@ def test_it_shows_a_crash_and_a_composition_that_its_buttons_asked_for(home: Hom
             page.until("!!document.querySelector('[data-node=\"a/tr.after\"]')")
             page.until("document.querySelector('[data-fact=\"last blackout\"]').textContent.endsWith(' ms')")
             page.value("document.querySelector('[data-words=\"inject hang primary\"]').click()")
+            page.until("document.getElementById('events').textContent.includes('alarm: b: hang')")
             page.until("parseFloat(document.querySelector('[data-fact=\"slowest reply\"]').textContent) > 5")
             for width, dark in ((1280, False), (420, True)):
                 page.look(tmp_path / f"page{width}.png", width, dark=dark)
