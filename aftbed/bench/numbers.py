@@ -1,13 +1,15 @@
 """`aftbed bench all`: every figure of docs/numbers.md in one table, by one command on one day.
 
-A line names the command that measures it. Each command is run once, in an interpreter of its own, as a user
-would start it; several lines may read its document. A figure stands beside its limit. The speed of a machine
-changes from minute to minute, so what can be compared is the ratio of the two, and nearly every document has
-it: both were measured in turn (`rounds`). A figure that is compared with that of another line (`lfr` with
-`pbr`) was measured minutes apart from it.
+A line names the command that measures it. Each command is run once in a pass, in an interpreter of its own,
+as a user would start it; several lines may read its document. A figure stands beside its limit. The speed of
+a machine changes from minute to minute, so what can be compared is the ratio of the two, and nearly every
+document has it: both were measured in turn (`rounds`). A figure that is compared with that of another line
+(`lfr` with `pbr`) was measured minutes apart from it.
 
-Of a ratio that a document has, the table shows as the p50 the median of the rounds with its quartiles, and
-the p99 over all rounds (`rounds.QuantileRatio`).
+Of a ratio that a document has, the table of one pass shows as the p50 the median of the rounds with its
+quartiles, and the p99 over all rounds (`rounds.QuantileRatio`). Of several passes, one behind the other, it
+shows the median of each value over the passes, and its quartiles over the passes: they say how far one pass
+can be trusted.
 """
 
 import datetime
@@ -22,6 +24,7 @@ import msgspec
 from aftbed.bench.rounds import Ratio
 from aftbed.bench.runs import Log, run_python, tried
 from aftbed.campaign.ledger import Environment, here
+from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import ConfigError
 from aftbed.core.progress import Show, unshown
 from aftbed.runtime.unix.code_version import code_version
@@ -57,7 +60,8 @@ class TableLine(msgspec.Struct, frozen=True):
 
     `goal`: the greatest value of each quantile's ratio to the limit; without a limit, of the figure itself;
     the least one where `more_is_better`. `ratio`: path of a ratio that the document has, a `Ratio` or the
-    number of the p50; "": the quotient is made here, of what was measured minutes apart.
+    number of the p50; "": the quotient is made here, of what was measured minutes apart. `counted`: the
+    values are numbers of events, which several passes add up.
     """
 
     what: str
@@ -68,6 +72,7 @@ class TableLine(msgspec.Struct, frozen=True):
     ratio: str = ""
     goal: dict[str, float] = {}
     more_is_better: bool = False
+    counted: bool = False
 
 
 def _cycle(what: str, options: str, limit: FigureLimit, **goal: float) -> TableLine:
@@ -90,7 +95,7 @@ def _adaptation(what: str, options: str, **goal: float) -> tuple[TableLine, ...]
     return (
         TableLine(f"{what}: no request is served for", command, "blackout_ms", "ms", OWN, OWN_RATIO, goal),
         TableLine("and back", command, "back.blackout_ms", "ms", OWN, f"back.{OWN_RATIO}", goal),
-        TableLine("the requests meanwhile", command, "requests", goal=kept),
+        TableLine("the requests meanwhile", command, "requests", goal=kept, counted=True),
     )
 
 
@@ -127,7 +132,7 @@ LINES: Final = (
     TableLine(
         "the same by the paper's recipe (the paper: 300 ms)", RECIPE, "blackout_ms", "ms", OWN, OWN_RATIO
     ),
-    TableLine("of these, never served again", RECIPE, "stuck"),
+    TableLine("of these, never served again", RECIPE, "stuck", counted=True),
     _state("cycle under `pbr`, 1 MB of state, a page changed", "--bytes 1000000", p50=2.0),
     TableLine(
         "the same beside what the machine allows", "state --bytes 1000000", "cycle_us", "us", OWN, OWN_RATIO
@@ -178,7 +183,9 @@ LINES: Final = (
 class Number(msgspec.Struct, frozen=True):
     """A line, measured. A figure without quantiles has the name "". `met`: None where there is no goal.
 
-    `quartiles` of the p50 of a ratio, and of how many rounds; none where the ratio is not one of rounds.
+    `quartiles`: of one pass, those of the p50 of a ratio over its `rounds`; None where the ratio is not one
+    of rounds. Of several passes, over them: of the p50 of the ratio, or of a figure without a limit (its p50,
+    if it has one); None of what is counted.
     """
 
     what: str
@@ -204,32 +211,41 @@ class Numbers(msgspec.Struct, frozen=True):
     seconds: float
     environment: Environment
     numbers: tuple[Number, ...]
+    passes: int = 1
 
 
 def bench_all(
     log: Log,
     *,
     quick: bool = False,
+    passes: int = 1,
     measure: Callable[[str], Document] | None = None,
     show: Show = unshown,
-) -> Numbers:
-    """Measure every line; `log` gets each command. Raises HarnessError if one fails again and again."""
+) -> Iterator[Numbers]:
+    """Measure every line `passes` times; yields after each pass what all up to now have found.
+
+    `log` gets each command. Raises HarnessError if one fails again and again.
+    """
     began_s = time.monotonic()
     run = measure or _measured
     commands = dict.fromkeys(line.command for line in LINES)
     words = {one: f"{one} {QUICK.get(one.split()[0], '')}".strip() if quick else one for one in commands}
-    found: dict[str, Document] = {}
-    for one, command in words.items():
-        show(len(found), len(words))
-        found[one] = tried(f"aftbed bench {command}", partial(run, command), log)
-    return Numbers(
-        datetime.datetime.now(datetime.UTC).date().isoformat(),
-        code_version(),
-        quick,
-        round(time.monotonic() - began_s, 1),
-        here(),
-        tuple(_number(line, found) for line in LINES),
-    )
+    by_pass: list[list[Number]] = []
+    for number in range(passes):
+        found: dict[str, Document] = {}
+        for one, command in words.items():
+            show(number * len(words) + len(found), passes * len(words))
+            found[one] = tried(f"aftbed bench {command}", partial(run, command), log)
+        by_pass.append([_number(line, found) for line in LINES])
+        yield Numbers(
+            datetime.datetime.now(datetime.UTC).date().isoformat(),
+            code_version(),
+            quick,
+            round(time.monotonic() - began_s, 1),
+            here(),
+            tuple(map(_over_passes, LINES, zip(*by_pass, strict=True))),
+            len(by_pass),
+        )
 
 
 def _measured(command: str) -> Document:
@@ -248,8 +264,6 @@ def _number(line: TableLine, found: dict[str, Document]) -> Number:
         limit = _at(found[line.limit.command or line.command], line.limit.path)
         limit_p50, limit_name = figure_at(limit, "p50")[""], line.limit.name or str(_at(limit, "name"))
         ratios, rounds = _ratios(line, document, measured, limit_p50)
-    judged = ratios or measured
-    kept = [judged[name] >= g if line.more_is_better else judged[name] <= g for name, g in line.goal.items()]
     return Number(
         line.what,
         f"aftbed bench {line.command}",
@@ -260,10 +274,48 @@ def _number(line: TableLine, found: dict[str, Document]) -> Number:
         ratios,
         line.goal,
         line.more_is_better,
-        all(kept) if kept else None,
+        _met(line, ratios or measured),
         (round(rounds.p50.q1, 2), round(rounds.p50.q3, 2)) if rounds is not None else None,
         rounds.rounds if rounds is not None else None,
     )
+
+
+def _met(line: TableLine, values: dict[str, float]) -> bool | None:
+    kept = [values[name] >= g if line.more_is_better else values[name] <= g for name, g in line.goal.items()]
+    return all(kept) if kept else None
+
+
+def _over_passes(line: TableLine, numbers: tuple[Number, ...]) -> Number:
+    """The line over all passes: the median of each value, and the quartiles of what is compared."""
+    if len(numbers) == 1:
+        return numbers[0]
+    measured = _summary([one.measured for one in numbers], sum if line.counted else _median)
+    ratios = _summary([one.ratios for one in numbers], _median)
+    limits = [one.limit_p50 for one in numbers if one.limit_p50 is not None]
+    compared = [one.ratios or one.measured for one in numbers]
+    name = next((name for name in ("p50", "") if name in compared[0]), None)
+    quartiles = None
+    if name is not None and not line.counted:
+        values = [one[name] for one in compared]
+        quartiles = quantile(values, 0.25), quantile(values, 0.75)
+    return msgspec.structs.replace(
+        numbers[0],
+        measured=measured,
+        limit_p50=_median(limits) if limits else None,
+        ratios=ratios,
+        met=_met(line, ratios or measured),
+        quartiles=quartiles,
+    )
+
+
+def _summary(values: list[dict[str, float]], of: Callable[[list[float]], float]) -> dict[str, float]:
+    """`of` the values of each name, in those dictionaries that have it."""
+    names = dict.fromkeys(name for one in values for name in one)
+    return {name: of([one[name] for one in values if name in one]) for name in names}
+
+
+def _median(values: list[float]) -> float:
+    return quantile(values, 0.5)
 
 
 def _ratios(
@@ -305,11 +357,12 @@ def figure_at(document: object, path: str) -> dict[str, float]:
 
 def markdown(found: Numbers) -> Iterator[str]:
     """The table, and the day and the machine above it."""
-    about = found.environment
+    about, several = found.environment, found.passes > 1
+    options = f"{' --quick' if found.quick else ''}{f' --passes {found.passes}' if several else ''}"
     yield (
-        f"Measured on {found.date} by `aftbed bench all{' --quick' if found.quick else ''}` in"
-        f" {found.seconds:.0f} s: {about.cpus}; {about.kernel.partition('-')[0]}; {about.python};"
-        f" aftbed {found.code}."
+        f"Measured on {found.date} by `aftbed bench all{options}` in {found.seconds:.0f} s: {about.cpus};"
+        f" {about.kernel.partition('-')[0]}; {about.python}; aftbed {found.code}."
+        + (f" Each value is the median of {found.passes} passes, with its quartiles." if several else "")
     )
     yield ""
     yield "| what | measured | limit beside it | ratio to its p50 | goal | command |"
@@ -323,7 +376,7 @@ def markdown(found: Numbers) -> Iterator[str]:
             )
         cells = (
             one.what,
-            _words(one.measured, one.unit),
+            _measured_words(one),
             limit,
             _ratio_words(one),
             goal,
@@ -332,18 +385,21 @@ def markdown(found: Numbers) -> Iterator[str]:
         yield f"| {' | '.join(cells)} |"
 
 
+def _measured_words(one: Number) -> str:
+    """`p50 1.5, p99 3.1 ms`; with the quartiles of its first value where there is no ratio that has them."""
+    return f"{_words(one.measured, None if one.ratios else one.quartiles)} {one.unit}".strip()
+
+
 def _ratio_words(one: Number) -> str:
     """`p50 1.5 (1.4 to 1.7), p99 3.1`."""
-    words = [f"{name} {value:g}" for name, value in one.ratios.items()]
-    if one.quartiles is not None:
-        words[0] += " ({:g} to {:g})".format(*one.quartiles)
+    return _words(one.ratios, one.quartiles)
+
+
+def _words(values: dict[str, float], quartiles: tuple[float, float] | None = None) -> str:
+    words = [f"{name} {value:g}".strip() for name, value in values.items()]
+    if quartiles is not None and words:
+        words[0] += " ({:g} to {:g})".format(*quartiles)
     return ", ".join(words)
-
-
-def _words(values: dict[str, float], unit: str = "") -> str:
-    """`p50 1.5, p99 3.1 ms`."""
-    words = ", ".join(f"{name} {value:g}".strip() for name, value in values.items())
-    return f"{words} {unit}".strip()
 
 
 def check_page(page: Path) -> None:

@@ -263,8 +263,12 @@ def soak(
 @bench.command(name="all")
 def every(
     quick: Annotated[bool, typer.Option("--quick", help="Two minutes: too few samples to quote.")] = False,
+    passes: Annotated[
+        int, typer.Option(min=1, help="Over all figures, one behind the other: their median and quartiles.")
+    ] = 1,
     into: Annotated[
-        Path | None, typer.Option(help="Write the table into this page, between its two markers.")
+        Path | None,
+        typer.Option(help="Write the table into this page, between its two markers, after each pass."),
     ] = None,
     json: Json = False,
 ) -> None:
@@ -274,10 +278,10 @@ def every(
     if into is not None:
         numbers.check_page(into)
     with _measuring("all", as_json=json) as progress:
-        found = numbers.bench_all(progress.step, quick=quick, show=progress.show)
+        for found in numbers.bench_all(progress.step, quick=quick, passes=passes, show=progress.show):
+            if into is not None:
+                numbers.write_into(into, found)
     print(msgspec.json.encode(found).decode() if json else "\n".join(numbers.markdown(found)))
-    if into is not None:
-        numbers.write_into(into, found)
 
 
 @bench.command()

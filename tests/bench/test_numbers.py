@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Final
 
@@ -77,7 +78,8 @@ def fake(command: str) -> Document:
 
 
 def measured() -> Numbers:
-    return bench_all(lambda _: None, measure=fake)
+    (found,) = bench_all(lambda _: None, measure=fake)
+    return found
 
 
 def line(what: str, command: str = "") -> Number:
@@ -88,14 +90,14 @@ def line(what: str, command: str = "") -> Number:
 
 def test_each_command_is_run_once() -> None:
     logged: list[str] = []
-    bench_all(logged.append, measure=fake)
+    list(bench_all(logged.append, measure=fake))
     assert len(logged) == len(set(logged)) == len({one.command for one in LINES})
     assert logged[0] == "aftbed bench cycle --ftm pbr"
 
 
 def test_a_quick_run_measures_less() -> None:
     logged: list[str] = []
-    found = bench_all(logged.append, quick=True, measure=fake)
+    (found,) = bench_all(logged.append, quick=True, measure=fake)
     assert logged[0] == "aftbed bench cycle --ftm pbr --count 200 --rounds 2"
     assert found.quick and found.numbers[0].command == "aftbed bench cycle --ftm pbr"
     assert set(QUICK) <= set(DOCUMENTS)
@@ -109,7 +111,8 @@ def test_a_command_that_fails_is_tried_again() -> None:
             raise HarnessError("the machine is too busy")
         return fake(command)
 
-    assert bench_all(logged.append, measure=flaky).numbers == measured().numbers
+    (found,) = bench_all(logged.append, measure=flaky)
+    assert found.numbers == measured().numbers
     assert logged[1] == "aftbed bench cycle --ftm pbr, again (the machine is too busy)"
 
 
@@ -182,6 +185,48 @@ def test_a_row_of_the_table() -> None:
 def test_every_row_has_as_many_cells_as_the_head() -> None:
     rows = [row for row in markdown(measured()) if row.startswith("|")]
     assert len(rows) == len(LINES) + 2 and {row.count("|") for row in rows} == {7}
+
+
+# -- several passes
+
+PASSES: Final = (1.4, 1.1, 1.2, 1.8, 1.3)
+
+
+def in_passes() -> list[Numbers]:
+    """Of passes in which nothing but the ratios, the memory and what was lost differs."""
+    begun: Counter[str] = Counter()
+
+    def measure(command: str) -> Document:
+        this = PASSES[begun[command]]
+        begun[command] += 1
+        found = fake(command)
+        if "ratio" in found:
+            found = {**found, "ratio": {**RATIO, "p50": {**RATIO["p50"], "median": this}}}
+        return found | ({"pss_mb": 10 * this} if command.startswith("memory") else {})
+
+    return list(bench_all(lambda _: None, passes=len(PASSES), measure=measure))
+
+
+def test_the_median_of_several_passes_stands_with_its_quartiles() -> None:
+    found = in_passes()
+    assert [one.passes for one in found] == [1, 2, 3, 4, 5]
+    cycle = found[-1].numbers[0]
+    assert cycle.ratios == {"p50": 1.3} and cycle.quartiles == (1.2, 1.4) and cycle.met
+    assert found[0].numbers[0].ratios == {"p50": 1.4} and found[0].numbers[0].met is False
+    rows = list(markdown(found[-1]))
+    assert " `aftbed bench all --passes 5` " in rows[0] and "median of 5 passes" in rows[0]
+    assert any("| p50 1.3 (1.2 to 1.4) |" in row for row in rows)
+
+
+def test_a_figure_without_a_limit_has_its_quartiles_over_passes() -> None:
+    (row,) = [row for row in markdown(in_passes()[-1]) if row.startswith("| memory of")]
+    assert "| 13 (12 to 14) MB |" in row
+
+
+def test_what_is_lost_in_any_pass_is_added_up() -> None:
+    found = next(one for one in in_passes()[-1].numbers if one.what == "the requests meanwhile")
+    assert (found.measured["sent"], found.measured["lost"]) == (500, 5)
+    assert found.met is False and found.quartiles is None
 
 
 # -- into a page
