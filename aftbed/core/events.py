@@ -63,6 +63,8 @@ class Event(Enum):
         self.label = label
         self.weight = weight
 
+    __hash__ = object.__hash__  # that of Enum is a Python function, and records are found by their event
+
     def __str__(self) -> str:
         return self.label
 

@@ -120,6 +120,28 @@ class StoredRecords(Stored[Record]):
         return (t_ns for part in self._parts() for (t_ns,) in _TIME.iter_unpack(part))
 
 
+class JournalsInMemory(dict[str, Sequence[Record]]):
+    """The journals of a run that has ended; their records are found by event without a look at the others."""
+
+    @functools.cached_property
+    def _by_time(self) -> list[Record]:
+        return sorted(itertools.chain.from_iterable(self.values()), key=lambda record: record.t_ns)
+
+    @functools.cached_property
+    def _positions(self) -> dict[Event, list[int]]:
+        """Of each event, in the order of time."""
+        found: dict[Event, list[int]] = {}
+        for at, record in enumerate(self._by_time):
+            found.setdefault(record.event, []).append(at)
+        return found
+
+    def events(self, *wanted: Event) -> list[Record]:
+        """The records of these events, of all nodes, by time."""
+        found = [self._positions[event] for event in dict.fromkeys(wanted) if event in self._positions]
+        at = found[0] if len(found) == 1 else sorted(itertools.chain.from_iterable(found))
+        return [self._by_time[position] for position in at]
+
+
 class History(msgspec.Struct, frozen=True):
     """What a run leaves behind: the records of all its nodes, by journal, and the dialogue of its client.
 
@@ -132,6 +154,8 @@ class History(msgspec.Struct, frozen=True):
 
     def events(self, *wanted: Event) -> list[Record]:
         """The records of these events, of all nodes, by time."""
+        if isinstance(self.journals, JournalsInMemory):
+            return self.journals.events(*wanted)
         found = [record for name in self.journals for record in self.events_of(name, *wanted)]
         return sorted(found, key=lambda record: record.t_ns)
 
@@ -144,9 +168,8 @@ class History(msgspec.Struct, frozen=True):
 
     def in_memory(self) -> "History":
         """The same, kept."""
-        return History(
-            {name: list(found) for name, found in self.journals.items()}, list(self.dialogue), self.dropped
-        )
+        journals = {name: list(found) for name, found in self.journals.items()}
+        return History(JournalsInMemory(journals), list(self.dialogue), self.dropped)
 
     def times(self) -> Iterator[int]:
         """Of all records and entries (ns)."""

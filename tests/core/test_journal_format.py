@@ -17,6 +17,7 @@ from aftbed.core.journal import (
     Entry,
     EntryKind,
     History,
+    JournalsInMemory,
     Record,
     StoredRecords,
     committed,
@@ -76,6 +77,16 @@ def test_stored_records_are_the_same_as_those_in_memory(
     assert one.events(*wanted) == other.events(*wanted)
     assert list(one.times()) == list(other.times())
     assert one.in_memory() == other
+
+
+@given(st.lists(some_records, max_size=3), st.sets(st.sampled_from(Event)))
+def test_journals_in_memory_are_found_by_event_as_by_a_look_at_all(
+    journals: list[list[Record]], wanted: set[Event]
+) -> None:
+    named = {f"a.after.{number}": found for number, found in enumerate(journals)}
+    by_event, looked_through = History(JournalsInMemory(named), []), History(named, [])
+    assert by_event.events(*wanted) == looked_through.events(*wanted)
+    assert by_event.events(*wanted, *wanted) == looked_through.events(*wanted)
 
 
 @given(some_records, st.integers(0, 100), st.sampled_from([36, 256, 1 << 16, 1 << 24, 2**32 - 1]))

@@ -17,7 +17,7 @@ from aftbed.core.application import Application
 from aftbed.core.errors import FUNCTION_FAILED, ConfigError, FunctionFailedError, PeerError
 from aftbed.core.events import Event
 from aftbed.core.graph import Graph, Link
-from aftbed.core.journal import Entry, EntryKind, History, Record
+from aftbed.core.journal import Entry, EntryKind, History, JournalsInMemory, Record
 from aftbed.core.messages import Goal, Reply, Scheduled
 from aftbed.ftm.client import Client
 from aftbed.ftm.compose import build, replication_of
@@ -566,7 +566,7 @@ class World:
         )
         return Run(
             self.setup,
-            History(self.journals, self.dialogue),
+            History(JournalsInMemory(self.journals), self.dialogue),
             rest,
             tuple(self.logged),
             tuple(self.controller.scripts),
