@@ -20,7 +20,6 @@ from aftbed.vehicle.can.hub import BEACON
 pytestmark = pytest.mark.process
 
 DRIVE: Final = CarRun("ccrs-20", None, "latch")
-REQUESTS: Final = 244  # of this drive
 FORGED: Final = b"< send 130 8 0 1 2 3 4 5 6 7 >"  # RADAR_TRACK
 ANSWER: Final = "< frame 100 "  # AEB_REQ
 FLOODS: Final = 2
@@ -66,7 +65,8 @@ def test_a_flood_of_forged_frames_does_not_starve_a_run_and_is_told(home: Home, 
         seen = b"".join(readable_of(one.pid) for one in own)
         outcome = run.finish()
     verdict = outcome.verdict
-    assert (verdict.requests.sent, verdict.requests.answered) == (REQUESTS, REQUESTS)
+    # How many the drive has depends on what its car is told, and by forged frames, too.
+    assert verdict.requests.answered == verdict.requests.sent and verdict.checks["complete"] == "pass"
     assert verdict.checks["no_forged_frames"] == "unknown" and verdict.verdict != "pass"
     assert {name for name, word in verdict.checks.items() if word == "fail"} <= {"vehicle"}
     (stranger,) = verdict.strangers
