@@ -49,6 +49,9 @@ BACKLOG_MAX: Final = {control.EVENT: 0.75, control.FINISHED: 1.0}
 COUNTS_SECONDS: Final = 0.2  # between two reports that differ in counts alone, at least
 LATE_NS_MAX: Final = 40_000_000  # of a look: beyond it the machine was too busy to judge what hangs
 DRAIN_SECONDS_MAX: Final = 2.0
+DRAIN_STARVED_SECONDS_MAX: Final = (
+    10.0  # beyond it, while the machine does not let the processes of the run run
+)
 DRAIN_SECONDS: Final = 0.005  # between two checks of what is still under way
 LOOKS_MAX: Final = 80  # at states that differ: time for a follower on a busy machine
 STOP_SECONDS_MAX: Final = 1.0
@@ -309,21 +312,21 @@ class Supervisor:
             return
         self._reason = reason
         self._loop.tasks.start("stop", self._work.stop_source(), lambda _: None)
-        self._drain(time.monotonic_ns() + round(DRAIN_SECONDS_MAX * 1e9))
+        self._drain(time.monotonic_ns(), self._waits_ns())
 
-    def _drain(self, limit_ns: int) -> None:
+    def _drain(self, began_ns: int, waits_ns: dict[int, int]) -> None:
         """Wait until all is answered, and what fails or changes has come to its end; or to the limit.
 
-        Of a service that is lost, neither is waited for.
+        Of a service that is lost, neither is waited for. `waits_ns`: when this began at `began_ns`.
         """
         unrest = self._work.awaits_replies or bool(self._controller.unrest())
         settled = self._work.ended and (self._lost or not unrest)
         command_gone = self._reason == COMMAND_GONE  # no process waits for a verdict
         if settled and self._looks_left:
             ask = self._deployment.ask_states(self._states)
-            self._loop.tasks.start("states", ask, lambda _: self._looked(limit_ns))
+            self._loop.tasks.start("states", ask, lambda _: self._looked(began_ns, waits_ns))
             return
-        if command_gone or settled or time.monotonic_ns() > limit_ns:
+        if command_gone or settled or self._drains_too_long(began_ns, waits_ns):
             if not settled and not command_gone:
                 self._unfinished = self._controller.under_way()
             self._controller.ending = True
@@ -331,13 +334,25 @@ class Supervisor:
             return
         if not len(self._loop.tasks):
             self._loop.tasks.start(STATS_TASK, self._work.wind_up(), lambda _: None)
-        self._loop.after(DRAIN_SECONDS, lambda: self._drain(limit_ns))
+        self._loop.after(DRAIN_SECONDS, lambda: self._drain(began_ns, waits_ns))
 
-    def _looked(self, limit_ns: int) -> None:
+    def _drains_too_long(self, began_ns: int, waits_ns: dict[int, int]) -> bool:
+        seconds = (time.monotonic_ns() - began_ns) / 1e9
+        if seconds <= DRAIN_SECONDS_MAX:
+            return False
+        waited_ns = [after - waits_ns.get(pid, 0) for pid, after in self._waits_ns().items()]
+        return drains_too_long(seconds, max(waited_ns) / 1e9)
+
+    def _waits_ns(self) -> dict[int, int]:
+        """How long each process of the run has waited for a CPU so far, by pid; this one included."""
+        pids = [os.getpid(), *(process.pid for process in self.pool.processes if process.pid)]
+        return {pid: linux.waited_ns(pid) for pid in pids}
+
+    def _looked(self, began_ns: int, waits_ns: dict[int, int]) -> None:
         """A replica may have yet to apply what was sent to it: look again, for a time."""
         self._looks_left = self._looks_left - 1 if len(set(self._states.values())) > 1 else 0
         pause_s = DRAIN_SECONDS if self._looks_left else 0.0
-        self._loop.after(pause_s, lambda: self._drain(limit_ns))
+        self._loop.after(pause_s, lambda: self._drain(began_ns, waits_ns))
 
     @property
     def reason(self) -> str | None:
@@ -406,6 +421,14 @@ class Supervisor:
         for one in starvation.values():
             one.close()
         return [f"{p.name} ({p.pid})" for p in dying]
+
+
+def drains_too_long(seconds: float, starved_s: float) -> bool:
+    """Whether the end is no longer waited for: after `DRAIN_SECONDS_MAX` in which all processes could run.
+
+    `starved_s`: for how long the one that waited longest was not let run in these `seconds`.
+    """
+    return seconds > DRAIN_SECONDS_MAX + min(starved_s, DRAIN_STARVED_SECONDS_MAX)
 
 
 def supervise(
