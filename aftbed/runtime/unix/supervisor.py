@@ -49,9 +49,7 @@ BACKLOG_MAX: Final = {control.EVENT: 0.75, control.FINISHED: 1.0}
 COUNTS_SECONDS: Final = 0.2  # between two reports that differ in counts alone, at least
 LATE_NS_MAX: Final = 40_000_000  # of a look: beyond it the machine was too busy to judge what hangs
 DRAIN_SECONDS_MAX: Final = 2.0
-DRAIN_STARVED_SECONDS_MAX: Final = (
-    10.0  # beyond it, while the machine does not let the processes of the run run
-)
+DRAIN_STARVED_SECONDS_MAX: Final = 10.0  # for which a process waited for a CPU meanwhile: not counted
 DRAIN_SECONDS: Final = 0.005  # between two checks of what is still under way
 LOOKS_MAX: Final = 80  # at states that differ: time for a follower on a busy machine
 STOP_SECONDS_MAX: Final = 1.0
