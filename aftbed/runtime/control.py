@@ -97,8 +97,8 @@ class Assign(ControlOrder, frozen=True):
     locals: tuple[Local, ...]
     cpu: int | None
     held: bool = False  # take no mail before a Resume
-    staged: bool = False  # it serves later: run the warm-up before
-    aside: int | None = None  # core of the warm-up
+    staged: bool = False  # it serves later
+    aside: int | None = None  # the core on which a staged node is made
     trial: SelfTest | None = None  # what is written off line must stand before it is wired
     device: str = ""  # see `devices`
     options: bytes = b""

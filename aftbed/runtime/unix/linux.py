@@ -17,8 +17,7 @@ import struct
 import sys
 import termios
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from itertools import chain
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -30,8 +29,6 @@ PR_SET_CHILD_SUBREAPER: Final = 36
 MADV_POPULATE_WRITE: Final = 23
 CLONE_NEWUSER: Final = 0x10000000
 CLONE_NEWNET: Final = 0x40000000
-SYS_PROCESS_MADVISE: Final = 440  # on every architecture but alpha; the C library may not have it
-IOV_MAX: Final = 1024  # areas in one call
 ADOPTION_SECONDS_MAX: Final = 5.0
 FILES_GOOD: Final = 1024  # a supervisor of 37 processes holds 180, more while it adapts
 _START: Final = 19  # the field `starttime` of /proc/PID/stat, the state being 0
@@ -40,10 +37,7 @@ REUSED_BYTES_MAX: Final = 16 << 20
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # malloc.h
 INHERITED_FD: Final = 3  # of an interpreter that `start_interpreter` started
 
-Area = tuple[int, int]  # of memory: address and bytes
-
 _libc: Final = ctypes.CDLL(None, use_errno=True)
-_libc.madvise.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int)
 
 
 def _prctl(option: int, argument: int) -> None:
@@ -223,24 +217,6 @@ def reuse_blocks() -> None:
     """
     _libc.mallopt(M_MMAP_THRESHOLD, REUSED_BYTES_MAX)
     _libc.mallopt(M_TRIM_THRESHOLD, 2 * REUSED_BYTES_MAX)
-
-
-def populate(areas: Sequence[Area]) -> None:
-    """Have the kernel copy these pages now, as if this process had written to them (Linux 5.14).
-
-    One call (process_madvise(2)) where the kernel takes this advice there, else one call for each area. Where
-    it takes none, nothing happens.
-    """
-    myself = os.pidfd_open(os.getpid())
-    for first in range(0, len(areas), IOV_MAX):
-        some = areas[first : first + IOV_MAX]
-        vector = struct.pack(f"{2 * len(some)}N", *chain.from_iterable(some))
-        count = ctypes.c_size_t(len(some))
-        done = _libc.syscall(SYS_PROCESS_MADVISE, myself, vector, count, MADV_POPULATE_WRITE, 0)
-        if done != sum(size for _, size in some):
-            for address, size in some:
-                _libc.madvise(address, size, MADV_POPULATE_WRITE)
-    os.close(myself)
 
 
 def waited_ns(pid: int) -> int:

@@ -28,7 +28,6 @@ from aftbed.runtime import control
 from aftbed.runtime.interface import BUS, LIGHT
 from aftbed.runtime.unix import linux, run_directory
 from aftbed.runtime.unix.cleanup import UndoLedger
-from aftbed.runtime.unix.linux import Area
 from aftbed.runtime.unix.options import LoadRun, RunOptions
 from aftbed.runtime.unix.process_pool import Started, start_zygote
 from aftbed.runtime.unix.transport import Line, decode_order, decode_report, read_file
@@ -41,7 +40,7 @@ GO: Final = b"go"
 _decode: Final = msgspec.msgpack.Decoder(RunOptions).decode
 
 
-_WARM: Final[dict[str, tuple[Area, ...]]] = {}  # by zygote: where its nodes will write to
+_WARM: Final[set[str]] = set()  # the zygotes that this process can fork
 
 
 def warm_up(name: str) -> None:
@@ -49,12 +48,13 @@ def warm_up(name: str) -> None:
 
     Their zygotes are forks from then on. That is for a process that starts many runs.
     """
-    from aftbed.runtime.unix import prefault, supervisor, zygote  # noqa: PLC0415 - for many runs
+    from aftbed.runtime.unix import rehearsal, supervisor, zygote  # noqa: PLC0415 - for many runs
 
     assert supervisor
     if name not in _WARM:
         zygote.preload(name)
-        _WARM[name] = prefault.warm_up()
+        rehearsal.warm_up()
+        _WARM.add(name)
 
 
 def begin_early(owner: socket.socket, *, has_bus: bool) -> NoReturn:
@@ -66,14 +66,14 @@ def begin_early(owner: socket.socket, *, has_bus: bool) -> NoReturn:
     linux.continue_at_parents_death()
     linux.set_name("aftbed-supervis")
     linux.allow_files()
-    from aftbed.runtime.unix import prefault, zygote  # noqa: PLC0415 - a launch does not need them
+    from aftbed.runtime.unix import rehearsal, zygote  # noqa: PLC0415 - a launch does not need them
 
     cpus = sorted(os.sched_getaffinity(0))
     zygotes: dict[str, Started] = {}
     with contextlib.suppress(OSError):  # no process can be forked: the launch will say so
         if has_bus:  # it has more to import
             zygotes[BUS] = zygote.fork(BUS, cpus)
-        prefault.rehearse()
+        rehearsal.rehearse()
         zygotes[LIGHT] = zygote.fork(LIGHT, cpus)
     from aftbed.runtime.unix import supervisor  # noqa: PLC0415 - the zygotes have less to copy without it
 
@@ -138,10 +138,10 @@ def _joined(zygotes: dict[str, Started], options: RunOptions, output: int) -> di
         return zygotes
     cpus = sorted(os.sched_getaffinity(0))
     largest = LIGHT if load else BUS
-    if (areas := _WARM.get(largest)) is not None:
+    if largest in _WARM:
         from aftbed.runtime.unix import zygote  # noqa: PLC0415 - imported by `warm_up`
 
-        return {name: zygote.fork(name, cpus, areas) for name in names}
+        return {name: zygote.fork(name, cpus, warm=True) for name in names}
     # It imports while this process does; the smaller one is started by the supervisor.
     return {largest: start_zygote(largest, cpus)}
 

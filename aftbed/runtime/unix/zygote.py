@@ -24,7 +24,7 @@ from typing import NoReturn
 import msgspec
 
 from aftbed.core.errors import ConfigError, FunctionFailedError
-from aftbed.ftm.client import Client
+from aftbed.ftm.client import PROXY, Client
 from aftbed.ftm.registry import find
 from aftbed.functions.load import Code, load_module
 from aftbed.functions.source import FunctionSource
@@ -33,22 +33,22 @@ from aftbed.runtime.assembly import Assembler
 from aftbed.runtime.devices import Device, Sensor
 from aftbed.runtime.interface import BUS, LIGHT
 from aftbed.runtime.node import Node
-from aftbed.runtime.unix import linux, prefault, run_directory
+from aftbed.runtime.unix import linux, rehearsal, run_directory
 from aftbed.runtime.unix.death_notice import Lifeline
 from aftbed.runtime.unix.devices import ProcessSenses, make_source
 from aftbed.runtime.unix.journal_files import JournalFile
-from aftbed.runtime.unix.linux import INHERITED_FD, Area
+from aftbed.runtime.unix.linux import INHERITED_FD
 from aftbed.runtime.unix.node_io import EXIT_ASSERT, UnixIO, UnixNode
 from aftbed.runtime.unix.options import SourceOptions
 from aftbed.runtime.unix.transport import ORDER_SECONDS, Line, decode_order
 from aftbed.vehicle.aeb.function import default_application
 
 
-def fork(name: str, cpus: list[int], areas: tuple[Area, ...] | None = None) -> tuple[int, socket.socket]:
+def fork(name: str, cpus: list[int], *, warm: bool = False) -> tuple[int, socket.socket]:
     """Fork the zygote `name` from this process: its pid, and our end of its control line.
 
-    That of the mechanism is forked from a process that has rehearsed. `areas`: where a node will write to, if
-    this process has found that out. Raises OSError.
+    That of the mechanism is forked from a process that has rehearsed. `warm`: this process has imported what
+    the zygote needs, and its memory is settled. Raises OSError.
     """
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     supervisor = os.getpid()
@@ -61,10 +61,11 @@ def fork(name: str, cpus: list[int], areas: tuple[Area, ...] | None = None) -> t
                 # The parent's may write to descriptors that are closed now, and will be those of journals.
                 sys.stdout, sys.stderr = (open(fd, "w", buffering=1, closefd=False) for fd in (1, 2))  # noqa: SIM115
                 _begin(supervisor, cpus)
-                if areas is None:
+                if not warm:
                     preload(name)
-                    areas = prefault.areas_of_a_child() if name == LIGHT else None
-                _serve(supervisor, areas)
+                    if name == LIGHT:
+                        rehearsal.settle()
+                _serve(supervisor, rehearsed=warm or name == LIGHT)
             except (BrokenPipeError, ConnectionResetError):  # there is no run
                 os._exit(0)
             except BaseException:  # noqa: BLE001 - the last frame of this process
@@ -90,11 +91,10 @@ def _begin(supervisor: int, cpus: list[int]) -> None:
     linux.reuse_blocks()
 
 
-def _serve(supervisor: int, areas: tuple[Area, ...] | None) -> NoReturn:
+def _serve(supervisor: int, *, rehearsed: bool) -> NoReturn:
     """Carry out what comes on the control line at `INHERITED_FD`, until it ends.
 
-    `areas` is None in a zygote that has not rehearsed: a drive waits for its first spares, so it rehearses
-    when they are forked.
+    A drive waits for its first spares, so a zygote that has not rehearsed does it when they are forked.
     """
     first = True
     gc.freeze()
@@ -107,14 +107,15 @@ def _serve(supervisor: int, areas: tuple[Area, ...] | None) -> NoReturn:
             _join(Path(order.private), fds)
             continue
         assert isinstance(order, control.Park), order
-        if areas is None and not first:
-            areas = prefault.warm_up()
+        if not rehearsed and not first:
+            rehearsal.warm_up()
+            rehearsed = True
         first = False
         for name in order.mechanisms:
             with contextlib.suppress(ConfigError):  # a node that needs it will say so
                 find(name)
         try:
-            _fork_spares(fds, supervisor, areas or ())
+            _fork_spares(fds, supervisor)
         except OSError as error:
             with contextlib.suppress(BrokenPipeError):  # the run has ended
                 line.send(control.Report("trouble", f"no process can be forked: {error.strerror}".encode()))
@@ -132,7 +133,7 @@ def _join(private: Path, fds: list[int]) -> None:
     os.close(log)
 
 
-def _fork_spares(fds: list[int], supervisor: int, areas: tuple[Area, ...]) -> None:
+def _fork_spares(fds: list[int], supervisor: int) -> None:
     """Fork one spare per descriptor, through an intermediate process that leaves them to the supervisor.
 
     Raises OSError if one cannot be forked.
@@ -152,7 +153,7 @@ def _fork_spares(fds: list[int], supervisor: int, areas: tuple[Area, ...]) -> No
                 os.dup2(descriptor, INHERITED_FD, inheritable=False)
                 os.closerange(INHERITED_FD + 1, 1 << 16)
                 try:
-                    _be_spare(supervisor, areas)
+                    _be_spare(supervisor)
                 except (BrokenPipeError, ConnectionResetError):  # the run has ended
                     os._exit(0)
         os._exit(0)
@@ -163,11 +164,10 @@ def _fork_spares(fds: list[int], supervisor: int, areas: tuple[Area, ...]) -> No
         raise OSError(refused, os.strerror(refused))
 
 
-def _be_spare(supervisor: int, areas: tuple[Area, ...]) -> NoReturn:
+def _be_spare(supervisor: int) -> NoReturn:
     """Wait for an order; then be the node or the service that it describes."""
     linux.die_with(supervisor)
     linux.set_name("aftbed-spare")
-    linux.populate(areas)
     line = Line(socket.socket(fileno=INHERITED_FD), decode_order)
     line.send(control.Hello(os.getpid()))
     got = line.recv()
@@ -199,6 +199,8 @@ def _make_node(line: Line[control.ToNode], order: control.Assign, fds: list[int]
     kind = order.bricks[0].kind
     if order.staged and order.aside is not None:
         os.sched_setaffinity(0, {order.aside})  # requests are served on the other one
+    if _waits(order):
+        rehearsal.rehearse_node(brick.kind for brick in order.bricks)
     if order.cpu is not None:
         os.sched_setaffinity(0, {order.cpu})
     if kind in ("watchdog", "recovery"):
@@ -214,6 +216,14 @@ def _make_node(line: Line[control.ToNode], order: control.Assign, fds: list[int]
     code = _NotedCode(Path(order.journal).parent.parent)
     Assembler(default_application, code).build(node, order, fds, lambda: _make_device(order, node))
     return io
+
+
+def _waits(order: control.Assign) -> bool:
+    """Whether that node has nothing to do, or not what it will do, until a failover or the commit of an
+    adaptation: its page faults would make that longer.
+    """
+    backs_up = any(brick.replica not in (None, order.leader) for brick in order.bricks)
+    return order.staged or backs_up or order.bricks[0].kind == PROXY.name
 
 
 class _NotedCode(Code):
@@ -260,4 +270,6 @@ def _make_device(order: control.Assign, node: UnixNode) -> Device:
 if __name__ == "__main__":
     _begin(int(sys.argv[1]), [int(cpu) for cpu in sys.argv[2].split(",")])
     preload(sys.argv[3])
-    _serve(int(sys.argv[1]), prefault.warm_up() if sys.argv[3] == LIGHT else None)
+    if sys.argv[3] == LIGHT:
+        rehearsal.warm_up()
+    _serve(int(sys.argv[1]), rehearsed=sys.argv[3] == LIGHT)

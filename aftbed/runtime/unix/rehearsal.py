@@ -1,26 +1,20 @@
-"""Warm-up of a zygote, so that the first request of a node is as fast as the others.
+"""What a zygote and its nodes do once in private, so that a node's first request is as fast as the others.
 
-*The rehearsal* sends requests through a whole chain in memory. It warms up the interpreter (specialised code,
-filled caches), which all children of the zygote inherit.
+*In a zygote* (`warm_up`) requests are sent through a whole chain in memory, until the interpreter has
+specialised the code on the path and filled its caches: all forks inherit that.
 
-*Pre-faulting.* A child of a fork shares each page with its parent until it writes there; then the kernel
-stops it and copies the page. In its first request a new node would take some hundred page faults: half a
-millisecond in each process of a new leader. `written_by` finds out, in a child that is thrown away, which
-pages some work writes to (pagemap in proc(5), bit 56: mapped by this process alone); `linux.populate` has
-the kernel copy the same pages in another child of the same parent, in one call.
-
-That is speed and nothing else: where the kernel does not show the pages, or does not take the advice, they
-are copied one by one at the first write.
+*In a node* (`rehearse_node`). A child of a fork shares each page with its parent until it writes there; then
+the kernel stops it and copies the page. In its first request a node takes some 300 such page faults: half a
+millisecond in each process of a new leader. A node that will have nothing to do until a failover or a commit
+takes them before it is joined to others: it does what it will do then, between ends of channels of its own.
 """
 
 import gc
 import os
 import socket
-import struct
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
-from pathlib import Path
 from typing import Final
 
 from aftbed.core import messages
@@ -41,123 +35,55 @@ from aftbed.ftm.chain import Compute, PassBefore, Protocol
 from aftbed.ftm.client import Proxy
 from aftbed.ftm.compose import REPLICAS, build, chain
 from aftbed.ftm.pbr import PbrAfter
-from aftbed.ftm.registry import Setting, make
+from aftbed.ftm.registry import Setting, last_word, make
 from aftbed.ftm.server import Server
 from aftbed.runtime import control
 from aftbed.runtime.node import MemoryIO, Node, nowhere
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.journal_files import JournalFile
-from aftbed.runtime.unix.linux import Area
 from aftbed.runtime.unix.node_io import UnixIO
 from aftbed.runtime.unix.transport import NUDGE, Line, decode_order, decode_report
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 
-ROUNDS_WARM: Final = 16  # until the interpreter has specialised all code on the path
-ROUNDS_ONCE: Final = 4
+ROUNDS: Final = 16  # until the interpreter has specialised all code on the path
+MAIL_ROUNDS: Final = 4  # in each of them
 MAIL_BATCH: Final = 8
-
-PAGE: Final = os.sysconf("SC_PAGE_SIZE")
-ENTRY: Final = struct.Struct("=Q")  # of pagemap
-PRESENT: Final = 1 << 63
-OF_A_FILE: Final = 1 << 61
-EXCLUSIVE: Final = 1 << 56
-CHUNK_BYTES: Final = 1 << 15
 
 Ends = dict[tuple[str, str], tuple[str, str]]  # brick and port that send -> brick and port that receive
 
 
-def warm_up() -> tuple[Area, ...]:
-    """Rehearse; then see `areas_of_a_child`."""
+def warm_up() -> None:
+    """Rehearse all that nodes do; then see `settle`."""
     rehearse()
-    return areas_of_a_child()
+    settle()
 
 
 def rehearse() -> None:
     """Until the interpreter has specialised the code on the path, here and for all forks."""
-    rehearse_chain(ROUNDS_WARM)
-    for _ in range(ROUNDS_WARM):
-        rehearse_host()
+    _rehearse_chain()
+    for _ in range(ROUNDS):
+        _rehearse_mail(MAIL_ROUNDS)
+        for work in _FAILOVER.values():
+            work()
 
 
-def areas_of_a_child() -> tuple[Area, ...]:
-    """Where a child of this process, which has rehearsed, will write to.
-
-    What is in memory by then stays there, and no garbage collection visits it: that would write to it.
-    """
+def settle() -> None:
+    """What is in memory by now stays, and no garbage collection visits it: in a fork that would copy it."""
     gc.collect()
     linux.trim()
     gc.freeze()
 
-    def once() -> None:
-        rehearse_chain(ROUNDS_ONCE)
-        rehearse_host()
 
-    return written_by(once)
-
-
-# -- pages ----------------------------------------------------------------------------------------
-
-
-def written_by(work: Callable[[], None]) -> tuple[Area, ...]:
-    """The memory of this process that `work`, done in a child, writes to; empty if that cannot be known."""
-    private = tuple(_private_areas())
-    reader, writer = os.pipe()
-    parent, child = os.getpid(), os.fork()
-    if child == 0:
-        try:
-            linux.die_with(parent)
-            work()
-            _dump_pagemap(private, writer)  # raw: to evaluate it here would write to more pages
-        finally:
-            os._exit(0)
-    os.close(writer)
-    with os.fdopen(reader, "rb") as pipe:
-        pagemap = pipe.read()
-    os.waitpid(child, 0)
-    if len(pagemap) != sum(size for _, size in private) // PAGE * ENTRY.size:
-        return ()
-    return tuple(_exclusive_areas(private, pagemap))
+def rehearse_node(kinds: Iterable[str]) -> None:
+    """In the process that will be a node with bricks of these kinds: mail, and their parts of a failover."""
+    _rehearse_mail(1)
+    for part in {last_word(kind) for kind in kinds} & _FAILOVER.keys():
+        _FAILOVER[part]()
+    gc.collect()  # nodes refer to themselves
 
 
-def _private_areas() -> Iterator[Area]:
-    """The writable memory of this process alone."""
-    for line in Path("/proc/self/maps").read_text().splitlines():
-        span, permissions, *_ = line.split()
-        if permissions.startswith("rw-p"):
-            low, high = (int(end, 16) for end in span.split("-"))
-            yield low, high - low
-
-
-def _dump_pagemap(areas: tuple[Area, ...], writer: int) -> None:
-    pagemap = os.open("/proc/self/pagemap", os.O_RDONLY)
-    for address, size in areas:
-        at, end = address // PAGE * ENTRY.size, (address + size) // PAGE * ENTRY.size
-        while at < end:
-            at += os.write(writer, os.pread(pagemap, min(CHUNK_BYTES, end - at), at))
-
-
-def _exclusive_areas(areas: tuple[Area, ...], pagemap: bytes) -> Iterator[Area]:
-    """The pages that the child had for itself; adjacent ones of an area are joined."""
-    entries = ENTRY.iter_unpack(pagemap)
-    for address, size in areas:
-        first = last = 0
-        for page, (entry,) in zip(range(address, address + size, PAGE), entries, strict=False):
-            if entry & (PRESENT | OF_A_FILE | EXCLUSIVE) != PRESENT | EXCLUSIVE:
-                continue
-            if page != last:
-                if last:
-                    yield first, last - first
-                first = page
-            last = page + PAGE
-        if last:
-            yield first, last - first
-
-
-# -- the rehearsal --------------------------------------------------------------------------------
-
-
-def rehearse_chain(rounds: int) -> None:
-    """Send `rounds` requests through both replicas; then the backup takes over and serves as many."""
+def _rehearse_chain() -> None:
+    """Send requests through both replicas; then the backup takes over and serves as many."""
     kinds, links, requests = _scene()
     node = Node("rehearsal", MemoryIO())
 
@@ -170,7 +96,7 @@ def rehearse_chain(rounds: int) -> None:
         node.step(hosted, CONTROL, Rebound(source[1], True, epoch))
 
     def serve() -> None:
-        for payload in requests[:rounds]:
+        for payload in requests:
             node.post("client", "submit", Submit(payload))
             while node.turn():
                 pass
@@ -199,7 +125,7 @@ def _scene() -> tuple[dict[str, str], Ends, list[bytes]]:
         for k in graph.links
         if not k.standby and {k.source, k.sink} <= set(names)
     }
-    return {name: graph.brick(name).kind for name in names}, links, sample_requests(0, ROUNDS_WARM)
+    return {name: graph.brick(name).kind for name in names}, links, sample_requests(0, ROUNDS)
 
 
 class _Scratch:
@@ -248,31 +174,11 @@ class _Scratch:
             end.close()
 
 
-def rehearse_host() -> None:
-    """A host at work: mail, orders between it, and what each brick does in a failover."""
-    _rehearse_mail()
-    _rehearse_promotion()
-    _rehearse_follow()
-    request, (payload,) = Request(2, 1, b""), sample_requests(0, 1)
-    _rehearse_steps(
-        Protocol(2, 1, leads=False),
-        (("aft2pro", TakeOver(2)), ("pxy2pro", request), ("aft2pro", Reply(2, 1, 2, b""))),
-        ("pro2bfr", "pro2pxy"),
-    )
-    _rehearse_steps(
-        Compute(), (("bfr2prd", request), ("srv2prd", Reply(2, 1, 2, b""))), ("prd2srv", "prd2aft")
-    )
-    _rehearse_steps(
-        Server(default_application(), 2),
-        (("prd2srv", Request(2, 1, payload)), ("aft2srv", CaptureState(2, 1))),
-        ("srv2prd", "srv2aft"),
-    )
-
-
-def _rehearse_mail() -> None:
+def _rehearse_mail(rounds: int) -> None:
+    """Mail, and orders between it."""
     scratch = _Scratch(PassBefore(), ("pro2bfr",), ("bfr2prd",))
     request_id = 0
-    for _ in range(ROUNDS_ONCE):
+    for _ in range(rounds):
         for _ in range(MAIL_BATCH):
             request_id += 1
             scratch.send("pro2bfr", Request(1, request_id, b""))
@@ -284,7 +190,7 @@ def _rehearse_mail() -> None:
     scratch.close()
 
 
-def _rehearse_promotion() -> None:
+def _promote() -> None:
     scratch = _Scratch(PbrAfter(1, leads=False), ("aft2aft", "srv2aft"), ("aft2srv", "aft2pro", "aft2aft"))
     scratch.order(control.Deliver(control.UNANSWERED, "brick", Promotion(2)))
     scratch.into["aft2aft"].shutdown(socket.SHUT_WR)
@@ -293,7 +199,7 @@ def _rehearse_promotion() -> None:
     scratch.close()
 
 
-def _rehearse_follow() -> None:
+def _follow() -> None:
     scratch = _Scratch(Proxy(), ("clt2pxy", "pro2pxy"), ("pxy2pro", "pxy2clt"))
     scratch.send("clt2pxy", Request(0, 1, b""))
     scratch.io.turn()
@@ -306,9 +212,43 @@ def _rehearse_follow() -> None:
     scratch.close()
 
 
-def _rehearse_steps(brick: Brick, mail: tuple[tuple[str, Message], ...], outputs: tuple[str, ...]) -> None:
+def _take_over() -> None:
+    _step(
+        Protocol(2, 1, leads=False),
+        (("aft2pro", TakeOver(2)), ("pxy2pro", Request(2, 1, b"")), ("aft2pro", Reply(2, 1, 2, b""))),
+        ("pro2bfr", "pro2pxy"),
+    )
+
+
+def _compute() -> None:
+    _step(
+        Compute(),
+        (("bfr2prd", Request(2, 1, b"")), ("srv2prd", Reply(2, 1, 2, b""))),
+        ("prd2srv", "prd2aft"),
+    )
+
+
+def _serve() -> None:
+    _, _, (payload, *_) = _scene()
+    _step(
+        Server(default_application(), 2),
+        (("prd2srv", Request(2, 1, payload)), ("aft2srv", CaptureState(2, 1))),
+        ("srv2prd", "srv2aft"),
+    )
+
+
+def _step(brick: Brick, mail: tuple[tuple[str, Message], ...], outputs: tuple[str, ...]) -> None:
     scratch = _Scratch(brick, tuple({port: None for port, _ in mail}), outputs)
     for port, message in mail:
         scratch.send(port, message)
         scratch.io.turn()
     scratch.close()
+
+
+_FAILOVER: Final[Mapping[str, Callable[[], None]]] = {  # by the part that a brick is
+    "protocol": _take_over,
+    "proceed": _compute,
+    "after": _promote,
+    "server": _serve,
+    "proxy": _follow,
+}
