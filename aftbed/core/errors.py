@@ -6,7 +6,6 @@ failed `assert` is a bug of ours: it ends the node, because fail-silence is the 
 """
 
 import contextlib
-import difflib
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Final
 
@@ -90,6 +89,8 @@ def unknown(
 
     `synonyms`: what words mean that others use for the same.
     """
+    import difflib  # noqa: PLC0415 - every process imports this module, and few need that
+
     names = sorted(allowed)
     by_lower = {name.lower(): name for name in names}
     meant = (synonyms or {}).get(found.lower())

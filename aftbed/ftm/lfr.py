@@ -18,8 +18,8 @@ follower's Protocol leads, the reply to every request that its leader may have a
 Limit: while a follower is being replaced (by state transfer), the leader serves alone.
 """
 
+from _blake2 import blake2b  # that of hashlib, which loads OpenSSL beside it into each node
 from enum import auto
-from hashlib import blake2b
 from typing import ClassVar, Final
 
 from aftbed.core.brick import (

@@ -12,7 +12,6 @@ a run has exchanged the function (`runtime.unix.trust`). Without one, it is what
 
 import re
 import shlex
-import shutil
 from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
@@ -69,7 +68,7 @@ class FunctionSource(msgspec.Struct, frozen=True):
         if self.kind is not FunctionKind.PROGRAM:
             return msgspec.structs.replace(self, place=other(self.place), part=self.part and other(self.part))
         first, *rest = self.words
-        first = paths.get(str(Path(shutil.which(first) or first).resolve()), first)
+        first = paths.get(str(Path(_which(first) or first).resolve()), first)
         return msgspec.structs.replace(self, place=shlex.join([first, *map(other, rest)]))
 
     def files(self) -> list[Path]:
@@ -81,7 +80,7 @@ class FunctionSource(msgspec.Struct, frozen=True):
             case FunctionKind.CLASS:
                 return []
             case FunctionKind.PROGRAM:
-                program = shutil.which(self.words[0])
+                program = _which(self.words[0])
                 if program is None:
                     raise ConfigError(f"{self.place}: no program {self.words[0]}")
                 found = [Path(program), *map(Path, self.words[1:])]
@@ -104,7 +103,7 @@ def parse_source(text: str) -> FunctionSource:
     place, colon, name = text.rpartition(":")
     if colon and place and name.isidentifier() and (place.endswith(".py") or " " not in place):
         return FunctionSource(FunctionKind.CLASS, place, name)
-    if len(text.split()) > 1 or "/" in text or Path(text).is_file() or shutil.which(text):
+    if len(text.split()) > 1 or "/" in text or Path(text).is_file() or _which(text):
         return FunctionSource(FunctionKind.PROGRAM, text)
     raise ConfigError(f"{text!r} names no function; {FORMS}")
 
@@ -151,7 +150,7 @@ def located(text: str, folder: Path | None = None) -> str:
                 raise ConfigError(f"{text}: which class of it? {text}:CLASS is allowed")
             if Path(first).is_dir():
                 raise ConfigError(f"{text}: is a directory; {FORMS}")
-            if shutil.which(first) is None:
+            if _which(first) is None:
                 raise ConfigError(f"{first} is no program that can be executed; {FORMS}")
             words = [str((here / word).absolute()) if (here / word).is_file() else word for word in rest]
             return _versioned(shlex.join([first, *words]), source.version)
@@ -174,3 +173,9 @@ def renamed(text: str) -> str:
     if not path.is_absolute():
         return ""
     return str(msgspec.structs.replace(source, place=f"{path.parent}/./{path.name}"))
+
+
+def _which(program: str) -> str | None:
+    import shutil  # noqa: PLC0415 - with it come three libraries of compression, which no node needs
+
+    return shutil.which(program)

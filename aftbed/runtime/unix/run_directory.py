@@ -23,9 +23,7 @@ import fcntl
 import mmap
 import os
 import re
-import secrets
 import select
-import shutil
 import signal
 import socket
 import stat
@@ -90,7 +88,7 @@ def free() -> Path:
         str(above).encode()
     except UnicodeEncodeError:  # messages could not carry it
         raise ConfigError(f"{above}: not UTF-8; set XDG_RUNTIME_DIR or TMPDIR to another path") from None
-    while (path := above / secrets.token_hex(ID_BYTES)).exists():
+    while (path := above / os.urandom(ID_BYTES).hex()).exists():
         pass
     over = socket_bytes(above) - SOCKET_PATH_MAX
     if over > 0:
@@ -164,6 +162,8 @@ def owned_here(private: Path) -> bool:
 
 def remove(private: Path) -> None:
     """Remove the private directory of a run that has ended."""
+    import shutil  # noqa: PLC0415 - with it come three libraries of compression, which no node needs
+
     shutil.rmtree(private, ignore_errors=True)
     if private in _owned:
         os.close(_owned.pop(private))

@@ -8,7 +8,6 @@ begin: the car is connected to it.
 import contextlib
 import json
 import os
-import secrets
 import socket
 import time
 from collections import deque
@@ -153,7 +152,7 @@ class Workload:
         self._options, self._pool, self._loop = options, pool, loop
         self._log, self._finish, self._report_owner, self._counted = log, finish, report_owner, counted
         self._is_load = isinstance(options.work, LoadRun)
-        self._secret = secrets.token_hex(SECRET_BYTES)  # of the bus: for the processes of this run alone
+        self._secret = os.urandom(SECRET_BYTES).hex()  # of the bus: for the processes of this run alone
         self._source = VEHICLE if isinstance(options.work, CarRun) else PLAYER  # of a run with a bus
         self._services: dict[str, UnixProcess] = {}
         self._ready: set[str] = set()  # names of services
