@@ -189,11 +189,7 @@ def header(node: str) -> bytes:
     """The first page of the journal of `node`."""
     name = node.encode()
     assert len(name) <= NAME_BYTES_MAX, node
-    page = bytearray(HEADER_BYTES)
-    page[: len(MAGIC)] = MAGIC
-    page[NAME_OFFSET] = len(name)
-    page[NAME_OFFSET + 1 : NAME_OFFSET + 1 + len(name)] = name
-    return bytes(page)
+    return (MAGIC.ljust(NAME_OFFSET, b"\0") + bytes((len(name),)) + name).ljust(HEADER_BYTES, b"\0")
 
 
 def node_name(data: Data) -> str:

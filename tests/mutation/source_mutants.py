@@ -289,7 +289,7 @@ MUTANTS: Final = (
         "the lifeline is never held",
         "G2",
         f"{UNIX}/zygote.py",
-        "    io.lifeline = Lifeline(Path(order.journal))\n",
+        "    io.lifeline = Lifeline(order.journal)\n",
         "",
         PROCESS,
         (KILLS + "test_there_are_the_seventeen_processes_of_the_paper",),

@@ -20,7 +20,6 @@ import mmap
 import os
 import signal
 import time
-from pathlib import Path
 from typing import Final
 
 from aftbed.core.journal import HEADER_BYTES, LIFELINE_OFFSET
@@ -49,6 +48,9 @@ class _RobustListHead(ctypes.Structure):
     )
 
 
+_HEAD_BYTES: Final = ctypes.c_size_t(ctypes.sizeof(_RobustListHead))
+
+
 class _Waiter(ctypes.Structure):
     _fields_ = (
         ("value", ctypes.c_uint64),
@@ -67,7 +69,7 @@ class _Word:
     may move.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: str) -> None:
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         try:
             self._mapping = mmap.mmap(descriptor, HEADER_BYTES)
@@ -88,7 +90,7 @@ class _Word:
 class Lifeline:
     """This thread's lifeline. It must stay referenced: the kernel reads its memory when the thread dies."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: str) -> None:
         self._word = _Word(path)
         self._entry, self._head = _RobustList(), _RobustListHead()
         self._entry.next = ctypes.addressof(self._head)
@@ -96,8 +98,7 @@ class Lifeline:
         self._head.futex_offset = self._word.address - ctypes.addressof(self._entry)
         if SYS_SET_ROBUST_LIST < 0:
             return
-        size = ctypes.c_size_t(ctypes.sizeof(self._head))
-        if _libc.syscall(SYS_SET_ROBUST_LIST, ctypes.byref(self._head), size) == 0:
+        if _libc.syscall(SYS_SET_ROBUST_LIST, ctypes.byref(self._head), _HEAD_BYTES) == 0:
             self._word.value = _thread.get_native_id() | FUTEX_WAITERS
 
 
@@ -111,7 +112,7 @@ class LifelineWatcher:
     def __init__(self, paths: tuple[str, ...]) -> None:
         self.fd, self._pipe = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         self.ended = False  # nothing more comes: the kernel has no lifelines, or no futex_waitv
-        self._words = [_Word(Path(path)) for path in paths]
+        self._words = [_Word(path) for path in paths]
         self._wanted = _thread.allocate_lock()  # held until it is closed
         self._wanted.acquire()
         try:

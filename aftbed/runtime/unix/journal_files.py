@@ -85,7 +85,7 @@ def entries_dropped(path: Path) -> int:
         return layout.dropped(file.read(layout.HEADER_BYTES))
 
 
-def _mapped(path: Path, name: str) -> mmap.mmap:
+def _mapped(path: Path | str, name: str) -> mmap.mmap:
     """A new file of one chunk with the header of `name`, mapped."""
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     try:
@@ -93,8 +93,10 @@ def _mapped(path: Path, name: str) -> mmap.mmap:
         mapping = mmap.mmap(descriptor, CHUNK_BYTES)
     finally:
         os.close(descriptor)
-    with contextlib.suppress(OSError, ValueError):  # Linux before 5.14: the pages come one by one
+    try:  # noqa: SIM105 - each node makes a journal, and this writes to fewer pages
         mapping.madvise(linux.MADV_POPULATE_WRITE, 0, READY_BYTES)
+    except (OSError, ValueError):  # Linux before 5.14: the pages come one by one
+        pass
     mapping[: layout.HEADER_BYTES] = layout.header(name)
     return mapping
 
@@ -125,7 +127,7 @@ class JournalFile:
     `at` is where the next record goes; beyond `end` the file must grow before another step.
     """
 
-    def __init__(self, path: Path | None, node: str) -> None:
+    def __init__(self, path: Path | str | None, node: str) -> None:
         """Without a path, one in memory that is not read."""
         self.mapping = mmap.mmap(-1, CHUNK_BYTES) if path is None else _mapped(path, node)
         self.at, self.end = layout.HEADER_BYTES, CHUNK_BYTES - STEP_BYTES_MAX

@@ -18,13 +18,13 @@ import sys
 import termios
 import time
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
 from aftbed.core.errors import HarnessError
 
 PR_SET_PDEATHSIG: Final = 1
-PR_SET_NAME: Final = 15
 PR_SET_CHILD_SUBREAPER: Final = 36
 MADV_POPULATE_WRITE: Final = 23
 CLONE_NEWUSER: Final = 0x10000000
@@ -37,13 +37,14 @@ REUSED_BYTES_MAX: Final = 16 << 20
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # malloc.h
 INHERITED_FD: Final = 3  # of an interpreter that `start_interpreter` started
 
-_libc: Final = ctypes.CDLL(None, use_errno=True)
+_libc: Final = ctypes.CDLL(None)  # without errno, which costs each process that forks some pages of memory
+_SIGKILL, _SIGCONT, _TRUE = map(ctypes.c_ulong, (signal.SIGKILL, signal.SIGCONT, 1))
+_NO_PRIORITY: Final = os.sched_param(0)
 
 
-def _prctl(option: int, argument: int) -> None:
-    if _libc.prctl(option, ctypes.c_ulong(argument), 0, 0, 0) != 0:
-        code = ctypes.get_errno()
-        raise HarnessError(f"prctl({option}, {argument}): {os.strerror(code)}")
+def _prctl(option: int, argument: ctypes.c_ulong) -> None:
+    if _libc.prctl(option, argument, 0, 0, 0) != 0:
+        raise HarnessError(f"the kernel refuses prctl({option}, {argument.value})")
 
 
 def die_with(parent: int) -> None:
@@ -52,19 +53,24 @@ def die_with(parent: int) -> None:
     The signal is bound to the parent of this moment, so this waits until `parent` has adopted the process. A
     dead one never does, and may have died before its child came here.
     """
+    if os.getppid() != parent:
+        _await_adoption(parent)
+    _prctl(PR_SET_PDEATHSIG, _SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
+
+
+def _await_adoption(parent: int) -> None:
     limit = time.monotonic() + ADOPTION_SECONDS_MAX
     while os.getppid() != parent:
         if dead(parent) or time.monotonic() > limit:
             os._exit(1)
         os.sched_yield()
-    _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(1)
 
 
 def continue_at_parents_death() -> None:
     """Have the kernel send SIGCONT to this process when its parent dies: if it was stopped, it goes on."""
-    _prctl(PR_SET_PDEATHSIG, signal.SIGCONT)
+    _prctl(PR_SET_PDEATHSIG, _SIGCONT)
 
 
 def _stat(pid: int) -> list[str]:
@@ -124,7 +130,7 @@ def use_batch_scheduling() -> None:
     SCHED_BATCH (sched(7)): the nodes of a chain share a core and wake each other in turn; without it
     some hops take two switches instead of one.
     """
-    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    os.sched_setscheduler(0, os.SCHED_BATCH, _NO_PRIORITY)
 
 
 def yield_cpu(nice: int) -> None:
@@ -163,13 +169,14 @@ def start_interpreter(
 
 
 def become_subreaper() -> None:
-    _prctl(PR_SET_CHILD_SUBREAPER, 1)
+    _prctl(PR_SET_CHILD_SUBREAPER, _TRUE)
 
 
 def set_name(name: str) -> None:
     """The name that `ps` and `/proc/PID/comm` show (15 bytes)."""
-    buffer = ctypes.create_string_buffer(name.encode()[:15])
-    _libc.prctl(PR_SET_NAME, buffer, 0, 0, 0)
+    comm = os.open("/proc/self/comm", os.O_WRONLY | os.O_CLOEXEC)
+    os.write(comm, name.encode()[:15])
+    os.close(comm)
 
 
 def allow_files() -> int:
@@ -257,6 +264,10 @@ def backlog(sock: socket.socket) -> float:
 
 def set_timeouts(sock: socket.socket, receive_seconds: float, send_seconds: float) -> None:
     """Kernel timeouts, which hold for plain reads and writes of the descriptor too."""
-    for option, seconds in ((socket.SO_RCVTIMEO, receive_seconds), (socket.SO_SNDTIMEO, send_seconds)):
-        value = struct.pack("ll", int(seconds), int(seconds % 1 * 1e6))
-        sock.setsockopt(socket.SOL_SOCKET, option, value)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _timeval(receive_seconds))
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _timeval(send_seconds))
+
+
+@lru_cache
+def _timeval(seconds: float) -> bytes:
+    return struct.pack("ll", int(seconds), int(seconds % 1 * 1e6))

@@ -42,7 +42,14 @@ from aftbed.runtime.node import MemoryIO, Node, nowhere
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.journal_files import JournalFile
 from aftbed.runtime.unix.node_io import UnixIO
-from aftbed.runtime.unix.transport import NUDGE, Line, decode_order, decode_report
+from aftbed.runtime.unix.transport import (
+    NUDGE,
+    ORDER_SECONDS,
+    WRITE_SECONDS_MAX,
+    Line,
+    decode_order,
+    decode_report,
+)
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 
 ROUNDS: Final = 16  # until the interpreter has specialised all code on the path
@@ -135,6 +142,7 @@ class _Scratch:
         self._ends: list[socket.socket] = []
         self._outputs = outputs
         ours, theirs = self.pair()
+        linux.set_timeouts(theirs, ORDER_SECONDS, WRITE_SECONDS_MAX)
         self.line = Line(ours, decode_report)
         self.io = UnixIO(Line(theirs, decode_order), JournalFile(None, "rehearsal"))
         self.node = Node("rehearsal", self.io)

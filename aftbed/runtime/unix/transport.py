@@ -109,6 +109,7 @@ def _borrowed(descriptor: int) -> Iterator[socket.socket]:
 
 FDS_MAX: Final = 64
 _LINE_RIGHTS_BYTES: Final = socket.CMSG_SPACE(FDS_MAX * 4)
+_CUT: Final = int(socket.MSG_TRUNC | socket.MSG_CTRUNC)  # of ints: `|` of flags is a function of Python
 
 decode_order: Callable[[bytes], ToNode] = msgspec.msgpack.Decoder(ToNode).decode
 decode_report: Callable[[bytes], FromNode] = msgspec.msgpack.Decoder(FromNode).decode
@@ -152,7 +153,7 @@ class Line(Generic[Incoming]):
                 os.close(fd)
             return None
         try:
-            if flags & (socket.MSG_TRUNC | socket.MSG_CTRUNC):
+            if flags & _CUT:
                 raise PeerError(f"truncated control message of {len(data)} bytes, {len(fds)} descriptors")
             if data == ANNOUNCED and len(fds) == 1:
                 data = read_file(fds.pop())

@@ -40,7 +40,7 @@ from aftbed.runtime.unix.journal_files import JournalFile
 from aftbed.runtime.unix.linux import INHERITED_FD
 from aftbed.runtime.unix.node_io import EXIT_ASSERT, UnixIO, UnixNode
 from aftbed.runtime.unix.options import SourceOptions
-from aftbed.runtime.unix.transport import ORDER_SECONDS, Line, decode_order
+from aftbed.runtime.unix.transport import ORDER_SECONDS, WRITE_SECONDS_MAX, Line, decode_order
 from aftbed.vehicle.aeb.function import default_application
 
 
@@ -207,13 +207,13 @@ def _make_node(line: Line[control.ToNode], order: control.Assign, fds: list[int]
         linux.use_short_slices()
     else:
         linux.use_batch_scheduling()
-    linux.set_timeouts(line.sock, ORDER_SECONDS, 2.0)
-    io = UnixIO(line, JournalFile(Path(order.journal), order.node))
+    linux.set_timeouts(line.sock, ORDER_SECONDS, WRITE_SECONDS_MAX)
+    io = UnixIO(line, JournalFile(order.journal, order.node))
     node = Node(order.node, io)
-    io.lifeline = Lifeline(Path(order.journal))
+    io.lifeline = Lifeline(order.journal)
     if kind == "engine":
         gc.enable()  # a plan leaves cycles behind, and the Engine is not on the request path
-    code = _NotedCode(Path(order.journal).parent.parent)
+    code = _NotedCode(order.journal)
     Assembler(default_application, code).build(node, order, fds, lambda: _make_device(order, node))
     return io
 
@@ -229,8 +229,12 @@ def _waits(order: control.Assign) -> bool:
 class _NotedCode(Code):
     """Notes in the record of the run what is not of this package, and loads by one name always the same."""
 
-    def __init__(self, record: Path) -> None:
-        self._record = record
+    def __init__(self, journal: str) -> None:
+        self._journal = journal  # of a node, in a folder of the record
+
+    @property
+    def _record(self) -> Path:
+        return Path(self._journal).parent.parent
 
     def module(self, place: str) -> ModuleType:
         return self._module(place)
