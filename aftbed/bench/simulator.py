@@ -6,6 +6,7 @@ as many functions as the simulator calls (counted by the interpreter's profile h
 wall time, since nothing in a simulated run waits.
 """
 
+import gc
 import sys
 import time
 from types import FrameType
@@ -81,12 +82,15 @@ def _calls(setup: Setup, count: int) -> int:
         nonlocal calls
         calls += event == "call"
 
-    before = sys.getprofile()
+    before, collects = sys.getprofile(), gc.isenabled()
+    gc.disable()  # it would call what others have registered with it
     sys.setprofile(note)
     try:
         _simulated(setup, count)
     finally:
         sys.setprofile(before)
+        if collects:
+            gc.enable()
     return calls
 
 

@@ -1,5 +1,6 @@
 """`aftbed bench simulator`: what it counts is the same from run to run, and the rate is that of the ratio."""
 
+import gc
 import sys
 
 import pytest
@@ -15,6 +16,23 @@ def test_calls_are_counted_and_the_profile_hook_is_as_before() -> None:
     assert sys.getprofile() is hook
     assert calls == calls_per_request(Setup("none"))
     assert 0 < calls < calls_per_request(Setup("pbr")), "a mechanism costs calls"
+
+
+def test_what_the_garbage_collector_calls_is_not_counted() -> None:
+    calls, collections = calls_per_request(Setup("none")), list[str]()
+
+    def collected(phase: str, _: dict[str, int]) -> None:
+        collections.append(phase)
+
+    threshold = gc.get_threshold()
+    gc.callbacks.append(collected)
+    gc.set_threshold(10)
+    try:
+        assert calls_per_request(Setup("none")) == calls
+    finally:
+        gc.set_threshold(*threshold)
+        gc.callbacks.remove(collected)
+    assert collections and gc.isenabled()
 
 
 def test_the_rate_is_that_of_the_median_round() -> None:
