@@ -69,10 +69,10 @@ IMPURE_PLACES: Final = (  # where clock, socket, process, file and chance may li
 SEEDED_PLACES: Final = ("aftbed.runtime.sim",)  # chance, but from a seed: nothing of `random` but its class
 SEEDED: Final = "from random import Random"
 PURE_MODULES: Final = frozenset(  # what the rest may import beside aftbed: neither clock nor I/O nor chance
-    ("__future__", "abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "difflib", "enum")
+    ("__future__", "_blake2", "abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "difflib")
     + (
+        "enum",
         "functools",
-        "_blake2",
         "hashlib",
         "heapq",
         "itertools",
