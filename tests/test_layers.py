@@ -70,19 +70,8 @@ SEEDED_PLACES: Final = ("aftbed.runtime.sim",)  # chance, but from a seed: nothi
 SEEDED: Final = "from random import Random"
 PURE_MODULES: Final = frozenset(  # what the rest may import beside aftbed: neither clock nor I/O nor chance
     ("__future__", "_blake2", "abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "difflib")
-    + (
-        "enum",
-        "functools",
-        "hashlib",
-        "heapq",
-        "itertools",
-        "math",
-        "msgspec",
-        "operator",
-        "re",
-        "statistics",
-    )
-    + ("string", "struct", "textwrap", "types", "typing", "zlib")
+    + ("enum", "functools", "hashlib", "heapq", "itertools", "math", "msgspec", "operator", "re")
+    + ("statistics", "string", "struct", "textwrap", "types", "typing", "zlib")
 )
 IMPURE_CALLS: Final = frozenset({"open", "input", "print", "exec", "eval", "__import__", "breakpoint"})
 
