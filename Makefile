@@ -11,23 +11,24 @@ DOCS     := $(VENV)/.installed-docs
 SOURCES  := pyproject.toml README.md $(shell find aftbed dbc -type f -not -name '*.pyc')
 
 # The tests without real runs take every core: those of one thing each, which are run while one edits, then whole
-# commands, searches and drives. Of real runs, each has a core for either replica: two at a time
-# are as many as two cores bear without false alarms. A file stays together, for the runs that its tests share;
-# each page of the docs is a unit of its own. They are taken in the order of collection, the small files last.
-# Only files that have tests of their kind are read: each worker imports them all.
+# commands, searches and drives. Of real runs, each has a core for either replica: two at a time are as many as two
+# cores bear without false alarms. A file stays together, for the runs that its tests share; a page of the docs, whose
+# commands are run, is a unit of its own. They are taken in the order of collection, the small files last. Only files
+# that have tests of their kind are read: each worker imports them all.
 FAST := -n auto --dist worksteal -m "not simulation and not process and not deep" \
   $(sort $(shell grep -rL --include='test_*.py' '^pytestmark = pytest.mark.\(process\|simulation\)$$' tests))
 SIMULATION := -n auto --dist worksteal -m "simulation and not process and not deep" \
   $(sort $(shell grep -rl --include='test_*.py' mark.simulation tests))
-REAL := -n 2 --dist loadgroup --no-loadscope-reorder -m "process and not deep" \
-  $(sort $(shell grep -rl --include='test_*.py' mark.process tests))
+TWO_AT_A_TIME := -n 2 --dist loadgroup --no-loadscope-reorder -m "process and not deep"
+PAGES := tests/docs/test_commands.py
+REAL := $(TWO_AT_A_TIME) $(filter-out $(PAGES),$(sort $(shell grep -rl --include='test_*.py' mark.process tests)))
 
 FAULT := crash primary at checkpoint.sent nth 100
 
 # Hundreds of interpreters start in the tests; without bytecode each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test lint fast simulation process deep mutants bench soak docs pictures
+.PHONY: help demo test lint fast simulation process pages deep mutants bench soak docs pictures
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
 
@@ -38,6 +39,7 @@ help:
 	@echo "make fast        the tests of one thing each, a minute: while one edits"
 	@echo "make simulation  the tests that simulate many runs or drives: whole commands, searches, planted bugs"
 	@echo "make process     the tests that start real runs: a sample of their combinations"
+	@echo "make pages       every command of README.md and docs/, run as it stands there: a CI's, after make test"
 	@echo "make deep        the exhaustive tests, and thousands of examples of every property: hours"
 	@echo "make docs        the pages of docs/ as a site: build/docs/index.html"
 	@echo "make pictures    the pictures of the README, of runs that it makes (ONLY=page: that one; with Chromium and tmux)"
@@ -64,6 +66,9 @@ simulation: $(EDITABLE)
 
 process: $(EDITABLE)
 	$(BIN)/python -m pytest $(REAL)
+
+pages: $(EDITABLE)
+	$(BIN)/python -m pytest $(TWO_AT_A_TIME) $(PAGES)
 
 deep: $(EDITABLE)
 	$(BIN)/python -m pytest -m deep
