@@ -39,6 +39,7 @@ def test_an_error_of_any_kind_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> 
     assert kept == [result]
 
 
+@pytest.mark.simulation
 def test_a_drive_is_compared_with_the_golden_one() -> None:
     """A car that hits what the bare server stops for is at least `unavailable`."""
     golden = golden_drive("ccrs-50", CALM.seed)
@@ -53,6 +54,7 @@ def test_a_drive_is_compared_with_the_golden_one() -> None:
 GHOST = "radar ghost range 30 speed 22 after 1s for {ms}ms"
 
 
+@pytest.mark.simulation
 @pytest.mark.parametrize(("ms", "outcome"), [(40, "masked"), (60, "unavailable")])
 def test_what_a_scenario_forbids_is_no_service_either(ms: int, outcome: str) -> None:
     """A car that brakes for nothing hits nothing; but `aftbed sim` fails such a drive."""

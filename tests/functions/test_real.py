@@ -81,6 +81,7 @@ def test_the_decision_chain_restores_exactly(aeb: ModuleType) -> None:
             assert other.capture() == states[later]
 
 
+@pytest.mark.simulation
 @pytest.mark.parametrize("ftm", SUITED)
 def test_the_decision_chain_survives_a_crash(aeb: ModuleType, ftm: str) -> None:
     assert crashed(f"{AEB}:AebDecision", AEB, ftm, "server.exit", 20) == ()
@@ -105,6 +106,7 @@ def test_rss_accepts_each_reply_of_the_chain_and_not_each_wrong_one(aeb: ModuleT
 # -- opendbc --------------------------------------------------------------------------------------
 
 
+@pytest.mark.simulation
 @pytest.mark.parametrize("ftm", SUITED)
 def test_the_safety_code_survives_a_crash(safety: dict[str, str], ftm: str) -> None:
     for nth in (5, 9, 21):

@@ -103,6 +103,7 @@ def test_a_wet_road_of_a_catalog(tmp_path: Path) -> None:
     assert imported(path).variations[0].drive.friction == 0.45
 
 
+@pytest.mark.simulation
 @pytest.mark.parametrize(
     ("row", "values"),
     [

@@ -106,6 +106,7 @@ def doomed(setup: Setup, brick: str, at: int) -> Doom:
     return Doom(brick, at % (effects(setup.ftm, setup.placement, setup.count)[brick] + 1))
 
 
+@pytest.mark.simulation
 @pytest.mark.parametrize(
     "ftm", [pytest.param(e, marks=[] if e in SAMPLE else [pytest.mark.deep]) for e in DUPLEX]
 )

@@ -44,6 +44,7 @@ def test_a_real_bus_in_lockstep_and_virtual_time_are_alike(words: str, tmp_path:
     assert over_hub.radar[0].receipt.state.value == "activated"
 
 
+@pytest.mark.simulation
 @pytest.mark.parametrize("words", ALIKE)
 def test_no_receiver_can_notice(words: str) -> None:
     """The frames are right: the E2E checks of the gateway refuse no more than without a fault."""
@@ -64,12 +65,14 @@ def test_a_fault_that_never_begins_leaves_every_frame_as_it_was() -> None:
     assert found.radar[0].receipt.state.value == "armed"
 
 
+@pytest.mark.simulation
 def test_a_car_that_is_missed_is_hit() -> None:
     assert drive("radar missed when ttc < 2").result.collision
     assert drive("radar fov range 5").result.collision
     assert not drive("radar missed for 500ms").result.collision
 
 
+@pytest.mark.simulation
 @pytest.mark.parametrize(
     "rising",
     [

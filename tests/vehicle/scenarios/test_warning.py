@@ -17,6 +17,8 @@ from aftbed.vehicle.scenarios.scenario import Scenario
 CODEC = load_dbc()
 CYCLE_NS = 20_000_000
 
+pytestmark = pytest.mark.simulation
+
 
 class WarnsOnly(AebFunction):
     """Never asks for braking."""
