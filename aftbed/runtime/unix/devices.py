@@ -40,7 +40,7 @@ class ProcessSenses(Senses):
         self._nodes = nodes = order.nodes
         self._pidfds = dict(zip(fds, nodes, strict=True))
         watched = zip(nodes, order.pids, order.journals, strict=True)
-        self._liveness = {node: Liveness(pid, Path(journal)) for node, pid, journal in watched}
+        self._liveness = {node: Liveness(pid, journal) for node, pid, journal in watched}
         self._lifelines = LifelineWatcher(order.journals)
 
     def forget(self) -> None:

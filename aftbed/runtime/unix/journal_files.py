@@ -182,7 +182,7 @@ class DialogueFile:
 class JournalHeader:
     """The header page of another node's journal: its activity, and the flag that announces control mail."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path | str) -> None:
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         try:
             self._mapping = mmap.mmap(descriptor, layout.HEADER_BYTES)

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Final
 
 from aftbed.runtime.devices import LOOK_NS
+from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.death_notice import FUTEX_OWNER_DIED
 from aftbed.runtime.unix.journal_files import JournalHeader
 
@@ -75,7 +76,7 @@ class Starvation:
         """
         state = state or self.state()
         try:
-            cpu_ns, waited_ns = map(int, Path(f"/proc/{self._pid}/schedstat").read_text().split()[:2])
+            cpu_ns, waited_ns = map(int, linux.proc_text(self._pid, "schedstat").split()[:2])
         except (OSError, ValueError, IndexError):
             return False
         if self._since_ns == 0:
@@ -104,7 +105,7 @@ class Starvation:
 class Liveness:
     """Of one node, in the eyes of one watcher, which looks now and then."""
 
-    def __init__(self, pid: int, journal: Path) -> None:
+    def __init__(self, pid: int, journal: Path | str) -> None:
         self.header = JournalHeader(journal)
         self._starvation = Starvation(pid)
         self._activity, self._seen_ns = -1, 0
@@ -143,7 +144,7 @@ class Liveness:
 def _children(pid: int) -> list[int]:
     """The processes that the main thread of `pid` has started; none where the kernel does not tell."""
     try:
-        return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+        return [int(child) for child in linux.proc_text(pid, f"task/{pid}/children").split()]
     except (OSError, ValueError):
         return []
 

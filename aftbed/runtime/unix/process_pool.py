@@ -112,8 +112,9 @@ class UnixProcess:
 
     def assigned(self) -> None:
         """It has acknowledged an Assign, so its journal exists."""
-        if self._liveness is None and self.journal and Path(self.journal).exists():
-            self._liveness = Liveness(self.pid, Path(self.journal))
+        if self._liveness is None and self.journal:
+            with contextlib.suppress(FileNotFoundError):  # one that refuses its Assign may have made none
+                self._liveness = Liveness(self.pid, self.journal)
 
     def announce(self) -> None:
         """Raise the flag: an order waits."""
