@@ -199,7 +199,7 @@ def _make_node(line: Line[control.ToNode], order: control.Assign, fds: list[int]
     kind = order.bricks[0].kind
     if order.staged and order.aside is not None:
         os.sched_setaffinity(0, {order.aside})  # requests are served on the other one
-    if _waits(order):
+    if waits(order):
         rehearsal.rehearse_node(brick.kind for brick in order.bricks)
     if order.cpu is not None:
         os.sched_setaffinity(0, {order.cpu})
@@ -218,7 +218,7 @@ def _make_node(line: Line[control.ToNode], order: control.Assign, fds: list[int]
     return io
 
 
-def _waits(order: control.Assign) -> bool:
+def waits(order: control.Assign) -> bool:
     """Whether that node has nothing to do, or not what it will do, until a failover or the commit of an
     adaptation: its page faults would make that longer.
     """
