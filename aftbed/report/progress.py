@@ -53,7 +53,7 @@ def pace(done: float, total: float, seconds: float, unit: str = "") -> str:
 def _per_second(rate: float) -> str:
     if rate < 1:
         return f"{60 * rate:.2g}/min"
-    return f"{spaced(rate) if rate >= 100 else f'{rate:.2g}'}/s"
+    return f"{spaced(rate) if rate >= 10 else f'{rate:.2g}'}/s"
 
 
 class ProgressLine:

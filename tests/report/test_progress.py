@@ -45,6 +45,7 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
         (1, 14, 60.0, "", "1 of 14, 1/min, 13:00 left"),
         (60, 1800, 60.0, "s", "60 of 1 800 s, 29:00 left"),
         (30, 0, 10.0, "runs", "30 runs, 3/s"),
+        (996, 0, 10.0, "runs", "996 runs, 100/s"),
         (0, 0, 10.0, "runs", ""),
     ],
 )
