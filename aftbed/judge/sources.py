@@ -136,12 +136,16 @@ def effects_missing(record: RunRecord, end: RunEnd) -> Iterator[str]:
     This is so where faults only end or stop processes, each node hosts one Server, and records found room. A
     Server that was put aside by an adaptation which was undone has not seen what happened meanwhile. A Server
     has none if it came after the last request, as a new backup or by an adaptation, or never came to be. The
-    recipe of the paper destroys bricks with what is inside them.
+    recipe of the paper destroys bricks with what is inside them, at any time of its blackout.
     """
     stopped = all(report.action.stops_process for report in record.faults)
     if _undone(record) or not stopped or record.options.placement == SINGLE or record.history.dropped:
         return
-    destroyed_ns = [one.opened_ns for one in record.adaptations if one.recipe != DRAINED]
+    destroyed_ns = [  # from when to when
+        (one.opened_ns - round(one.blackout_ms * 1e6), one.opened_ns)
+        for one in record.adaptations
+        if one.recipe != DRAINED
+    ]
     sent = ((e.request_id, e.t_ns) for e in record.history.dialogue if e.kind is EntryKind.SENT)
     last_sent, sent_ns = max(sent, default=(0, 0))
     ready_ns = [one.t_ns for one in record.history.events(Event.BACKUP_READY)]
@@ -151,7 +155,7 @@ def effects_missing(record: RunRecord, end: RunEnd) -> Iterator[str]:
     for name in sorted(record.history.journals, key=_incarnation):
         last, last_ns = 0, 0
         for one in record.history.events_of(name, *EFFECTS):
-            lost = any(last_ns < t_ns < one.t_ns for t_ns in destroyed_ns)
+            lost = any(last_ns < until_ns and since_ns < one.t_ns for since_ns, until_ns in destroyed_ns)
             if last and one.request_id > last + 1 and not lost:
                 yield f"the journal {name} lacks what was between requests {last} and {one.request_id}"
             last, last_ns = one.request_id, one.t_ns
@@ -164,7 +168,7 @@ def effects_missing(record: RunRecord, end: RunEnd) -> Iterator[str]:
             f"the journal {name} ends with request {last}, and {last_sent} was the last one"
             for node, (name, last, last_ns) in newest.items()
             if last != last_sent and (last or came) and node.partition(".")[0] in serving
-            if last_ns >= max(destroyed_ns, default=0)
+            if last_ns >= max((until_ns for _, until_ns in destroyed_ns), default=0)
         )
 
 

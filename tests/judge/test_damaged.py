@@ -4,6 +4,7 @@ With its old seal every change is told. With a new one, the sources have to cont
 record means the same: see `meaning`.
 """
 
+import re
 import shutil
 from functools import cache
 from pathlib import Path
@@ -93,17 +94,19 @@ def test_a_journal_that_was_just_being_made_is_no_gap(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("recipe", "lost", "reasons"),
+    ("recipe", "blackout_ms", "lost", "reasons"),
     [
-        ("drained", 9, ["the journal b.server.1 lacks what was between requests 8 and 10"]),
-        ("paper", 9, []),
-        ("paper", 4, ["the journal b.server.1 lacks what was between requests 3 and 5"]),
+        ("drained", 1000.0, 9, ["the journal b.server.1 lacks what was between requests 8 and 10"]),
+        ("paper", 0.0, 9, []),
+        ("paper", 1000.0, 4, []),
+        ("paper", 0.0, 4, ["the journal b.server.1 lacks what was between requests 3 and 5"]),
+        ("paper", 1000.0, 11, ["the journal b.server.1 lacks what was between requests 10 and 12"]),
     ],
 )
 def test_only_the_recipe_of_the_paper_may_lose_a_checkpoint(
-    tmp_path: Path, recipe: str, lost: int, reasons: list[str]
+    tmp_path: Path, recipe: str, blackout_ms: float, lost: int, reasons: list[str]
 ) -> None:
-    """At its turn: it destroys bricks with what is inside them."""
+    """In its blackout: it destroys bricks with what is inside them."""
     path = write_run(tmp_path / "run", setup(crash_at=0))
     journal = path / "journal" / "b.server.1.journal"
     whole = journal.read_bytes()
@@ -112,7 +115,8 @@ def test_only_the_recipe_of_the_paper_may_lose_a_checkpoint(
     journal.write_bytes(whole[:HEADER_BYTES] + b"".join(kept))
     for name in ("run.json", HISTORY_NAME):
         told = path / name
-        told.write_text(told.read_text().replace("drained", recipe))
+        text = told.read_text().replace("drained", recipe)
+        told.write_text(re.sub(r'("blackout_ms": ?)[\d.]+', rf"\g<1>{blackout_ms}", text))
     seal.write(path)
     assert judge(read_record(path)).reasons == [f"sources_agree: {one}" for one in reasons]
 

@@ -180,13 +180,13 @@ def test_a_new_version_of_the_function_takes_over_where_the_old_one_stopped(run:
 
 
 def test_the_recipe_of_the_paper_is_told_as_such(run: Command) -> None:
-    """It kills bricks with the mail inside: all that is known of the verdict is that there is one."""
+    """It may lose requests, so there is nothing to be said of the verdict."""
     assert done("switch", "lfr", "--recipe", "paper")["recipe"] == "paper"
     assert [o["recipe"] for o in history()] == ["paper"]
     refused = aftbed("adapt", "to", "pbr", "--recipe", "papr")
     assert refused.code == 2 and "did you mean 'paper'?" in refused.err
     aftbed("stop")
-    assert run.done().code in (0, 1, 3)
+    assert run.done().code in (0, 1)
 
 
 def test_adaptations_that_were_asked_for_beforehand(home: Home) -> None:
