@@ -99,9 +99,19 @@ class Assign(ControlOrder, frozen=True):
     held: bool = False  # take no mail before a Resume
     staged: bool = False  # it serves later
     aside: int | None = None  # the core on which a staged node is made
+    rehearse: bool = False  # before it joins: see Rehearse
     trial: SelfTest | None = None  # what is written off line must stand before it is wired
     device: str = ""  # see `devices`
     options: bytes = b""
+
+
+class Rehearse(ControlOrder, frozen=True):
+    """To a node that has nothing to do, or not what it will do, until a failover or a commit: do once in
+    private what bricks of these kinds do then, so that the node takes no page faults then. Simulated nodes
+    have no pages, and do nothing.
+    """
+
+    kinds: tuple[str, ...]
 
 
 class Serve(ControlOrder, frozen=True):
@@ -351,8 +361,8 @@ class ServiceState(msgspec.Struct, frozen=True):
 
 
 ToNode = (
-    Park | JoinRun | Assign | Serve | BindInput | BindOutput | Follow | Rewire | SuspendNode | ResumeNode
-    | Capture | Restore | Deliver | WatchNodes | Arm | SlowDown | ShareState | DisturbBus
+    Park | JoinRun | Assign | Rehearse | Serve | BindInput | BindOutput | Follow | Rewire | SuspendNode
+    | ResumeNode | Capture | Restore | Deliver | WatchNodes | Arm | SlowDown | ShareState | DisturbBus
     | DisturbRadar | WatchCar | Stop | StopRequests | Stats | Ack
 )  # fmt: skip
 FromNode = Hello | Ack | BrickReport | Ordered | Fired | Report

@@ -293,7 +293,8 @@ class Deployment:
             self.channels.renew(link)
         sent = []
         for node in self.graph.nodes:
-            sent.append((yield from self._assign(node, held=node in held)))
+            waits = node == "proxy" or replica_of(node) not in ("", self.leader)
+            sent.append((yield from self._assign(node, held=node in held, rehearse=waits)))
         yield from self.answers(sent, BIRTH_SECONDS_MAX)
         if len(self.slots) > 1:
             self.backup = REPLICAS[1]
@@ -317,6 +318,16 @@ class Deployment:
         self.assert_whole(slot)
         slot.complete = True
         yield from self.watch(slot)
+
+    def rehearse(self, replica: str) -> None:
+        """Have the nodes of a new backup rehearse. They do not before it is ready: until then a crash of the
+        leader ends the service.
+        """
+        for node in self.slots[replica].nodes:
+            with contextlib.suppress(StepFailed):  # it is dead, and its replica lost
+                kinds = tuple(kind for _, kind in self.process(node).bricks)
+                self.leave(node, control.Rehearse(control.UNANSWERED, kinds))
+                self._nudge(node)
 
     def assert_whole(self, slot: Slot) -> None:
         """Raise StepFailed if a node of `slot` is dead."""
@@ -377,19 +388,21 @@ class Deployment:
             if node == f"{slot.name}/watchdog":
                 yield from self.watch(slot)
 
-    def _assign(self, node: str, *, held: bool = False) -> Generator[Wait, dict[Key, bytes], Sent]:
+    def _assign(
+        self, node: str, *, held: bool = False, rehearse: bool = False
+    ) -> Generator[Wait, dict[Key, bytes], Sent]:
         """Make a spare this node, with its ends of channels."""
-        process, sent = yield from self._make(node, self.graph, staged=False, held=held)
+        process, sent = yield from self._make(node, self.graph, staged=False, held=held, rehearse=rehearse)
         process.kind = ProcessKind.NODE
         self.nodes[node] = process
         return sent
 
     def stage(self, node: str, graph: Graph, *, held: bool) -> Generator[Wait, dict[Key, bytes], Staged]:
         """Make a spare this node of `graph`, beside the nodes that serve, without any channel."""
-        return (yield from self._make(node, graph, staged=True, held=held))
+        return (yield from self._make(node, graph, staged=True, held=held, rehearse=True))
 
     def _make(
-        self, node: str, graph: Graph, *, staged: bool, held: bool
+        self, node: str, graph: Graph, *, staged: bool, held: bool, rehearse: bool
     ) -> Generator[Wait, dict[Key, bytes], Staged]:
         names = frozenset(graph.nodes[node])
         specs = tuple(map(graph.brick, graph.nodes[node]))
@@ -424,6 +437,7 @@ class Deployment:
                 held,
                 staged,
                 self.cpu_of("recovery"),
+                rehearse,
                 trial,
                 device,
                 options,

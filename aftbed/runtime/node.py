@@ -84,6 +84,12 @@ class NodeIO(Protocol[In, Out]):
         """Send to the executive."""
         ...
 
+    def rehearse(self, kinds: tuple[str, ...]) -> None:
+        """Do once in private what bricks of these kinds do in a failover. By default nothing: only in a
+        process is the first time slower than the next.
+        """
+        return
+
     def memory(self, number: int) -> memoryview:
         """The shared memory that came with an order as `number`."""
         raise AssertionError(f"no memory {number}")
@@ -598,6 +604,8 @@ class Node(Generic[In, Out]):
                 return self.agent.share_state(brick, number, self.io.memory(fds.pop()))
             case control.Stats():
                 return self.device.stats() if self.device is not None else b""
+            case control.Rehearse(_, kinds):
+                self.io.rehearse(kinds)
             case control.StopRequests():
                 assert self.device is not None
                 self.device.quiet()

@@ -120,6 +120,8 @@ class RunController:
 
         def settle() -> None:  # spares, and faults that are still to come
             if ordered.kind is ScriptKind.NEW_BACKUP:
+                if not run.failure:
+                    self.deployment.rehearse(ordered.replica)
                 self._loop.after(RESTOCK_SECONDS, partial(self._restock_after, len(self.scripts)))
             self._rearm()
 

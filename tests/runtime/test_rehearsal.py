@@ -5,9 +5,15 @@ import sys
 
 import pytest
 
-from aftbed.core.graph import BrickSpec
+from aftbed.core.events import Event
+from aftbed.ftm.compose import build, chain
+from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Trigger
+from aftbed.inject.model import Fault
 from aftbed.runtime import control
-from aftbed.runtime.unix.zygote import waits
+from aftbed.runtime.interface import Process
+from aftbed.runtime.sim.processes import SimProcessPool
+from aftbed.runtime.sim.world import Setup, simulate
 
 SCRIPT = """
 import os, resource, sys
@@ -42,23 +48,33 @@ def test_a_node_that_has_rehearsed_takes_hardly_a_page_fault_in_what_it_did(kind
     assert nothing_left == "True"
 
 
-@pytest.mark.parametrize(
-    ("name", "kind", "staged", "expected"),
-    [
-        ("a/protocol", "protocol", False, False),
-        ("b/protocol", "protocol", False, True),
-        ("a/tr.before", "tr.before", True, True),
-        ("proxy", "proxy", False, True),
-        ("client", "client", False, False),
-        ("recovery", "recovery", False, False),
-    ],
-)
-def test_a_node_rehearses_that_serves_from_a_failover_or_a_commit_on(
-    name: str, kind: str, staged: bool, expected: bool
+def test_what_waits_for_a_failover_rehearses_and_a_new_backup_when_it_is_ready(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    bricks = (BrickSpec(name, kind),)
-    order = control.Assign(1, name, "", bricks, 1, "a", (), (), (), cpu=None, staged=staged)
-    assert waits(order) == expected
+    """Until it is, the next crash ends the service; so it is not made to wait."""
+    at_birth: list[str] = []
+    later: list[tuple[str, tuple[str, ...], int]] = []
+    send = SimProcessPool.order
+
+    def order(
+        pool: SimProcessPool, process: Process, order: control.ToNode, fds: tuple[int, ...] = ()
+    ) -> None:
+        if isinstance(order, control.Assign) and order.rehearse:
+            at_birth.append(order.node)
+        elif isinstance(order, control.Rehearse):
+            later.append((process.name, order.kinds, pool.clock.ns))
+        send(pool, process, order, fds)
+
+    monkeypatch.setattr(SimProcessPool, "order", order)
+    crash = Fault(Crash(), "primary", Trigger("server.exit", 3))
+    run = simulate(Setup("pbr", "process", 1, 40, faults=(crash,)))
+    graph = build("pbr", "process")
+    assert sorted(at_birth) == [*sorted(chain(graph, "b")), "proxy"]
+    assert sorted((name, kinds) for name, kinds, _ in later) == [
+        (name, (graph.brick(name).kind,)) for name in sorted(chain(graph, "a"))
+    ]
+    (ready,) = run.history.events(Event.BACKUP_READY)
+    assert all(t_ns > ready.t_ns for *_, t_ns in later)
 
 
 REUSES = """

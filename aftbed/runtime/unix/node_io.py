@@ -101,8 +101,14 @@ class UnixIO(NodeIO[Inlet, int]):
 
     output = int
 
-    def __init__(self, line: Line[control.ToNode], journal: JournalFile) -> None:
+    def __init__(
+        self,
+        line: Line[control.ToNode],
+        journal: JournalFile,
+        rehearse: Callable[[tuple[str, ...]], None] = lambda kinds: None,
+    ) -> None:
         self.line, self.journal = line, journal
+        self._rehearse = rehearse
         self.lifeline: Lifeline | None = None  # kept, not used: the kernel reads it when this process dies
         self._announced: Inlet | None = None  # the next packet there is a large one
         self._used_ns = self._owed_ns = 0  # CPU time at the last throttle; what is left to wait
@@ -124,6 +130,10 @@ class UnixIO(NodeIO[Inlet, int]):
 
     def report(self, report: control.FromNode) -> None:
         self.line.send(report)
+
+    def rehearse(self, kinds: tuple[str, ...]) -> None:
+        """Do once in private what bricks of these kinds do in a failover."""
+        self._rehearse(kinds)
 
     def memory(self, number: int) -> memoryview:
         """The memory behind that descriptor, which is closed."""

@@ -24,7 +24,7 @@ from typing import NoReturn
 import msgspec
 
 from aftbed.core.errors import ConfigError, FunctionFailedError
-from aftbed.ftm.client import PROXY, Client
+from aftbed.ftm.client import Client
 from aftbed.ftm.registry import find
 from aftbed.functions.load import Code, load_module
 from aftbed.functions.source import FunctionSource
@@ -199,7 +199,7 @@ def _make_node(line: Line[control.ToNode], order: control.Assign, fds: list[int]
     kind = order.bricks[0].kind
     if order.staged and order.aside is not None:
         os.sched_setaffinity(0, {order.aside})  # requests are served on the other one
-    if waits(order):
+    if order.rehearse:
         rehearsal.rehearse_node(brick.kind for brick in order.bricks)
     if order.cpu is not None:
         os.sched_setaffinity(0, {order.cpu})
@@ -208,7 +208,7 @@ def _make_node(line: Line[control.ToNode], order: control.Assign, fds: list[int]
     else:
         linux.use_batch_scheduling()
     linux.set_timeouts(line.sock, ORDER_SECONDS, WRITE_SECONDS_MAX)
-    io = UnixIO(line, JournalFile(order.journal, order.node))
+    io = UnixIO(line, JournalFile(order.journal, order.node), rehearsal.rehearse_node)
     node = Node(order.node, io)
     io.lifeline = Lifeline(order.journal)
     if kind == "engine":
@@ -216,14 +216,6 @@ def _make_node(line: Line[control.ToNode], order: control.Assign, fds: list[int]
     code = _NotedCode(order.journal)
     Assembler(default_application, code).build(node, order, fds, lambda: _make_device(order, node))
     return io
-
-
-def waits(order: control.Assign) -> bool:
-    """Whether that node has nothing to do, or not what it will do, until a failover or the commit of an
-    adaptation: its page faults would make that longer.
-    """
-    backs_up = any(brick.replica not in (None, order.leader) for brick in order.bricks)
-    return order.staged or backs_up or order.bricks[0].kind == PROXY.name
 
 
 class _NotedCode(Code):
