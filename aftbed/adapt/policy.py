@@ -44,7 +44,7 @@ import msgspec
 from msgspec import Meta
 
 from aftbed.core.errors import ConfigError, FileKeyError, unknown
-from aftbed.core.events import Event
+from aftbed.core.events import LATE, Event
 from aftbed.ftm.compose import DUPLEX, SIMPLEX, known_expressions, parse, replicates
 from aftbed.ftm.registry import MECHANISMS, find
 
@@ -334,11 +334,13 @@ def symptoms(event: Event, detail: int) -> tuple[Symptom, ...]:
     """What a recorded event is a symptom of. Crashes and hangs are reported by a Watchdog, with their cause.
 
     A value fault shows as a divergence, as a detected stop (no majority, an assertion that failed), or as a
-    vote that masked it. Under PBR alone it does not show at all.
+    vote that masked it. Under PBR alone it does not show at all. A stop at a deadline tells of no value.
     """
     match event:
         case Event.FOLLOWER_DIVERGED:
             return ("divergence", "value_fault")
+        case Event.DETECTED_STOP if detail == LATE:
+            return ("detected_stop",)
         case Event.DETECTED_STOP:
             return ("detected_stop", "value_fault")
         case Event.VOTE_COMPARED if detail == VOTE_MASKED:

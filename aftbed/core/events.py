@@ -72,6 +72,7 @@ class Event(Enum):
 BY_CODE: Final = {event.code: event for event in Event}
 BY_LABEL: Final = {event.label: event for event in Event}
 
+LATE: Final = 1  # detail of `detected.stop`: a deadline had passed; what was late may have been right
 RERUN: Final = 1  # detail of `server.enter` and `server.exit`: the request ran again, from the same state
 
 REQUEST_EVENTS: Final = frozenset(event for event in Event if event.weight is Weight.ROUTINE)

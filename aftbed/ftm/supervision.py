@@ -44,7 +44,7 @@ from aftbed.core.brick import (
     Send,
     hand_on,
 )
-from aftbed.core.events import Event
+from aftbed.core.events import LATE, Event
 from aftbed.core.messages import AnyMessage, Reply, Request, TakeOver
 from aftbed.ftm.chain import COMPUTE, PassState
 from aftbed.ftm.declaration import BrickKind, Emits, Mechanism, Suitability
@@ -56,8 +56,8 @@ NEVER_NS: Final = 1 << 63
 _EXIT: Final = Event.BEFORE_EXIT  # bound once: a look-up in an enumeration is slow on the hot path
 
 
-def stop(request_id: int, reason: str) -> list[Effect]:
-    return [Note(Event.DETECTED_STOP, request_id), Halt(reason)]
+def stop(request_id: int, reason: str, detail: int = 0) -> list[Effect]:
+    return [Note(Event.DETECTED_STOP, request_id, detail), Halt(reason)]
 
 
 class SupBefore(Machine):
@@ -169,7 +169,8 @@ class SupAfter(Machine):
     def stop_late(self, msg: Reply | DeadlinePassed) -> list[Effect]:
         """No reply, or too late."""
         self._until_ns = None
-        return stop(self.announced, f"request {self.announced} took more than {self._allowed_ns / 1e6:g} ms")
+        reason = f"request {self.announced} took more than {self._allowed_ns / 1e6:g} ms"
+        return stop(self.announced, reason, LATE)
 
     def deadline_ns(self) -> int | None:
         return self._until_ns

@@ -39,7 +39,7 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from aftbed.core.events import RERUN, Event
+from aftbed.core.events import LATE, RERUN, Event
 from aftbed.core.journal import EntryKind, Record
 from aftbed.ftm.compose import REPLICAS, build
 from aftbed.inject.bus import BusFault
@@ -143,14 +143,15 @@ def starved(starved_ms: float, seconds: float) -> bool:
 
 
 def false_alarm(evidence: Evidence) -> bool:
-    """Whether a Watchdog suspected a replica before anything had been done to the run."""
+    """Whether a replica was given up as too slow before a fault had struck: by a Watchdog, which may be
+    right where the run was adapted, or by the deadline of Supervision.
+    """
     history = evidence.record.history
-    alarms = (record.t_ns for record in history.events(Event.WATCHDOG_SUSPECT))
+    suspicions = [] if evidence.record.adaptations else history.events(Event.WATCHDOG_SUSPECT)
+    stops = [one for one in history.events(Event.DETECTED_STOP) if one.detail == LATE]
+    first_ns = min((record.t_ns for record in (*suspicions, *stops)), default=None)
     strikes = (record.t_ns for record in history.events(Event.FAULT_APPLIED))
-    first_ns = min(alarms, default=None)
-    if first_ns is None or evidence.record.adaptations:
-        return False
-    return first_ns < min(strikes, default=first_ns + 1)
+    return first_ns is not None and first_ns < min(strikes, default=first_ns + 1)
 
 
 def intervals(evidence: Evidence) -> list[HandlingIntervals]:

@@ -22,7 +22,7 @@ from aftbed.adapt.policy import (
     symptoms,
 )
 from aftbed.core.errors import ConfigError
-from aftbed.core.events import Event
+from aftbed.core.events import LATE, Event
 from aftbed.ftm.compose import EXPRESSIONS, parse
 
 # -- actions
@@ -203,6 +203,7 @@ def test_a_file_that_is_no_policy_is_refused(tmp_path: Path, text: str, reason: 
         (Event.VOTE_COMPARED, 3, ("value_fault",)),
         (Event.VOTE_COMPARED, 0, ()),  # the detected stop that follows counts
         (Event.DETECTED_STOP, 0, ("detected_stop", "value_fault")),
+        (Event.DETECTED_STOP, LATE, ("detected_stop",)),
         (Event.FOLLOWER_DIVERGED, 0, ("divergence", "value_fault")),
         (Event.SERVER_EXIT, 3, ()),
     ],

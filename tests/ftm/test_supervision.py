@@ -4,7 +4,7 @@ import pytest
 from samples import notes, sends
 
 from aftbed.core.brick import Effect, Halt, Note, Send
-from aftbed.core.events import Event
+from aftbed.core.events import LATE, Event
 from aftbed.core.messages import Reply, Request, TakeOver
 from aftbed.ftm.failover import HANG_DEADLINE_NS
 from aftbed.ftm.supervision import DEADLINE_NS, LENIENT_NS, SupAfter, SupBefore
@@ -14,10 +14,10 @@ REQUEST = Request(2, 7, b"what")
 REPLY = Reply(2, 7, 1, b"that")
 
 
-def stopped(effects: list[Effect], request_id: int) -> str:
+def stopped(effects: list[Effect], request_id: int, detail: int = 0) -> str:
     """The reason of a detected stop: nothing leaves the replica with it."""
     note, halt = effects
-    assert note == Note(Event.DETECTED_STOP, request_id) and isinstance(halt, Halt)
+    assert note == Note(Event.DETECTED_STOP, request_id, detail) and isinstance(halt, Halt)
     return halt.reason
 
 
@@ -54,12 +54,12 @@ def test_a_reply_in_time_goes_on() -> None:
 
 def test_a_reply_that_does_not_come_stops_the_replica() -> None:
     brick = supervising()
-    assert stopped(brick.wake(NOW_NS + DEADLINE_NS), 7) == "request 7 took more than 25 ms"
+    assert stopped(brick.wake(NOW_NS + DEADLINE_NS), 7, LATE) == "request 7 took more than 25 ms"
 
 
 def test_a_reply_that_comes_late_does_not_leave() -> None:
     late = supervising().step("prd2aft", REPLY, NOW_NS + DEADLINE_NS)
-    assert stopped(late, 7) == "request 7 took more than 25 ms"
+    assert stopped(late, 7, LATE) == "request 7 took more than 25 ms"
 
 
 @pytest.mark.parametrize("number", [6, 8])

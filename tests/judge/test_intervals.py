@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tales import Sums, Tale
 
-from aftbed.core.events import FIRST_FAULT, RERUN, Event
+from aftbed.core.events import FIRST_FAULT, LATE, RERUN, Event
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import BusTimes, ReceiptState
 from aftbed.judge.checks import Check, Evidence
@@ -95,6 +95,19 @@ def test_a_suspicion_before_anything_struck_is_a_false_alarm() -> None:
     assert false_alarm(evidence(alarmed))
     assert false_alarm(evidence(struck(alarmed), CRASH))
     assert not false_alarm(evidence(a_crash(), CRASH))
+
+
+@pytest.mark.parametrize(("detail", "alarmed"), [(LATE, True), (0, False)])
+def test_a_stop_at_a_deadline_before_anything_struck_is_one_also_in_a_run_that_was_adapted(
+    detail: int, alarmed: bool
+) -> None:
+    tale = Tale().served(1).sent(2).note("a/sup.after.1", Event.DETECTED_STOP, 2, detail)
+    done = Outcome(1, "to sup", "drained", "sup", "done", asked="to sup")
+    found = evidence(tale)
+    found = msgspec.structs.replace(found, record=msgspec.structs.replace(found.record, adaptations=(done,)))
+    assert false_alarm(found) == alarmed
+    late = struck(Tale().served(1).sent(2)).note("a/sup.after.1", Event.DETECTED_STOP, 2, detail)
+    assert not false_alarm(evidence(late, CRASH))
 
 
 def test_the_supervisor_detects_the_death_of_a_node_of_no_replica() -> None:

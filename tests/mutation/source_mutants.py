@@ -945,6 +945,37 @@ MUTANTS: Final = (
         UNIT,
         ("tests/adapt/test_resilience.py::test_a_mechanism_more_answers_what_it_is_said_to_answer",),
     ),
+    SourceMutant(
+        "the recipe of the paper is excused for its last moment alone",
+        "G8",
+        f"{JUDGE}/sources.py",
+        "last_ns < until_ns and since_ns < one.t_ns",
+        "last_ns < until_ns < one.t_ns",
+        UNIT,
+        ("tests/judge/test_damaged.py::test_only_the_recipe_of_the_paper_may_lose_a_checkpoint",),
+    ),
+    SourceMutant(
+        "a stop at a deadline is no false alarm where the run was adapted",
+        "G8",
+        f"{JUDGE}/intervals.py",
+        "if one.detail == LATE]",
+        "if one.detail == LATE and not evidence.record.adaptations]",
+        UNIT,
+        (
+            "tests/judge/test_intervals.py::test_a_stop_at_a_deadline_before_anything_struck_is_one_also_in_a_run_that_was_adapted",
+        ),
+    ),
+    SourceMutant(
+        "a new backup rehearses before it is ready",
+        "G1",
+        f"{RUNTIME}/deployment.py",
+        "sent.append((yield from self._assign(node)))",
+        "sent.append((yield from self._assign(node, rehearse=True)))",
+        UNIT,
+        (
+            "tests/runtime/test_rehearsal.py::test_what_waits_for_a_failover_rehearses_and_a_new_backup_when_it_is_ready",
+        ),
+    ),
 )
 
 
