@@ -285,7 +285,7 @@ class _Faults:
         wrong_ns = (t_ns for t_ns in self._replies.wrong_ns if t_ns >= one.began_ns)
         wrong = any(not until_ns or t_ns < until_ns for t_ns in wrong_ns)
         latent = not (stops or wrong or detected_ns is not None) and self._ends_latent
-        stopped_ns = _first_from(self._stops, one.began_ns)
+        stopped_ns = _first_from(self._stops, one.began_ns if detected_ns is None else detected_ns)
         reaction, ended_ns = Reaction.NONE, None
         if not wrong and not latent:
             if good is not None:

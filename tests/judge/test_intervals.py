@@ -157,6 +157,11 @@ def test_a_detected_stop_without_a_reply_behind_it_is_safe() -> None:
     assert times(only(tale, FLIP, "tr")) == (1.0, 0.0, 1.0, "safe")
 
 
+def test_a_stop_before_a_crash_was_noticed_is_no_reaction_to_it() -> None:
+    tale = struck(Tale().served(1).sent(2)).note("b/tr.after.1", Event.DETECTED_STOP, 2)
+    assert times(only(tale.note("supervisor.1", Event.NODE_DIED), CRASH)) == (2.0, None, None, "none")
+
+
 def test_a_state_that_is_wrong_and_undetected_is_latent() -> None:
     tale = struck(Tale().served(1).sent(2), request_id=2).executed(2).accepted(2).answered(2)
     given = evidence(tale, FLIP)

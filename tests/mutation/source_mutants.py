@@ -955,6 +955,15 @@ MUTANTS: Final = (
         ("tests/judge/test_damaged.py::test_only_the_recipe_of_the_paper_may_lose_a_checkpoint",),
     ),
     SourceMutant(
+        "what stopped before a crash was noticed is a reaction to it",
+        "G8",
+        f"{JUDGE}/intervals.py",
+        "_first_from(self._stops, one.began_ns if detected_ns is None else detected_ns)",
+        "_first_from(self._stops, one.began_ns)",
+        UNIT,
+        ("tests/judge/test_intervals.py::test_a_stop_before_a_crash_was_noticed_is_no_reaction_to_it",),
+    ),
+    SourceMutant(
         "a stop at a deadline is no false alarm where the run was adapted",
         "G8",
         f"{JUDGE}/intervals.py",
