@@ -4,26 +4,27 @@ The classes are those of the design (section 2), the worst one wins. A run that 
 if the fault had no visible effect, `tolerated` if the mechanism had to act in sight: a failover, a third
 execution, a refused adaptation. `inconclusive` and `harness_error` are not about the mechanism, and never
 a pass (G8).
+
+A worker that carries out experiments on real processes imports no simulator: all nodes are forks of it, and
+copy what it has.
 """
 
-import itertools
 import shlex
 import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import msgspec
 from msgspec import Meta
 
 from aftbed.adapt.commands import read, scheduled
 from aftbed.campaign.states import RunState, states_of
-from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.core.errors import HarnessError
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Scheduled
-from aftbed.core.progress import Show, unshown
 from aftbed.core.script import RECIPES
 from aftbed.core.units import duration
 from aftbed.ftm.compose import build, detects
@@ -36,20 +37,20 @@ from aftbed.judge.handling_bound import STALL_NS
 from aftbed.judge.intervals import FTTI, HandlingIntervals, false_alarm, starved
 from aftbed.judge.outcome import FAILED, OUTCOMES, UNKNOWN, outcome_of, worst
 from aftbed.judge.record import RunEnd, RunRecord, read_record
-from aftbed.judge.simulated import evidence_of_run
-from aftbed.judge.verdict import Breach, Verdict, evidence_of, judge
+from aftbed.judge.verdict import Verdict, evidence_of, judge
 from aftbed.runtime.interface import BUS, LIGHT
-from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import CarRun, LoadRun, Work, with_names_resolved
 from aftbed.runtime.unix.seal import copy_sealed
 from aftbed.runtime.unix.supervisor_process import warm_up
 from aftbed.runtime.unix.trust import OWN_RUN, Trust, remember, vetted
-from aftbed.search.shrink import shrink
 from aftbed.vehicle.plant import VehicleResult
 from aftbed.vehicle.scenarios.library import load_scenario
 from aftbed.vehicle.scenarios.scenario import Scenario, broken_expectations
+
+if TYPE_CHECKING:
+    from aftbed.runtime.sim.world import Setup
 
 REQUESTS_MAX: Final = 1_000_000  # of one experiment
 RATE_HZ_MAX: Final = 100_000
@@ -268,8 +269,10 @@ def refuse_untrusted(experiment: Experiment, trust: Trust) -> None:
         vetted(source, trust)
 
 
-def setup_of(experiment: Experiment, code: Code = NO_CODE) -> Setup:
+def setup_of(experiment: Experiment, code: Code = NO_CODE) -> "Setup":
     """The experiment for the simulator. `code`: of a function that makes its requests. Raises ConfigError."""
+    from aftbed.runtime.sim.world import Setup  # noqa: PLC0415 - the simulator, see above
+
     faults, changes = _asked(experiment)
     return Setup(
         experiment.ftm,
@@ -300,6 +303,9 @@ def _asked(experiment: Experiment) -> tuple[tuple[Fault, ...], tuple[Scheduled, 
 
 
 def _simulated(experiment: Experiment, code: Code) -> Result:
+    from aftbed.judge.simulated import evidence_of_run  # noqa: PLC0415 - the simulator, see above
+    from aftbed.runtime.sim.world import simulate  # noqa: PLC0415
+
     evidence = evidence_of_run(simulate(setup_of(experiment, code), code), code)
     outcome, reasons = outcome_of(evidence)
     reasons += tuple(f"an assertion failed: {failure}" for failure in evidence.record.failures)
@@ -451,48 +457,10 @@ def forbidden_by(scenario: Scenario, found: VehicleResult, golden: VehicleResult
 @lru_cache(maxsize=256)
 def golden_drive(scenario: str, seed: int) -> VehicleResult | None:
     """The drive of the car with the bare server, and no fault."""
+    from aftbed.runtime.sim.world import Setup, simulate  # noqa: PLC0415 - the simulator, see above
+
     return simulate(Setup("none", seed=seed, scenario=scenario)).vehicle
 
 
 def _longest(times: Iterable[float | None]) -> float | None:
     return max((t for t in times if t is not None), default=None)
-
-
-# -- the smallest experiment with the same outcome ------------------------------------------------
-
-
-def smallest(result: Result, show: Show = unshown) -> Experiment:
-    """In the simulator; `show` gets how many runs were tried.
-
-    Raises ConfigError where the experiment does not come to the same there.
-    """
-    first = msgspec.structs.replace(result.experiment, runtime="sim")
-    setup = setup_of(first)
-
-    tries = itertools.count(1)
-
-    def same(simpler: Setup) -> tuple[Breach, ...]:
-        show(next(tries), 0)
-        found = carry_out(_as(first, simpler), lambda _: None, NO_CODE)
-        return (Breach(found.outcome, "; ".join(found.reasons)),) if found.outcome == result.outcome else ()
-
-    if not same(setup):
-        raise ConfigError(
-            f"experiment {result.experiment.id}: the simulator does not come to {result.outcome} with it,"
-            " so it cannot be shrunk there: `aftbed campaign replay` runs it again as it was"
-        )
-    return _as(first, shrink(setup, same))
-
-
-def _as(first: Experiment, setup: Setup) -> Experiment:
-    """`first` with what `setup` has."""
-    return msgspec.structs.replace(
-        first,
-        ftm=setup.ftm,
-        placement=setup.placement,
-        requests=setup.count,
-        rate_hz=setup.rate_hz,
-        scenario=setup.scenario,
-        faults=tuple(map(str, setup.faults)),
-        adaptations=first.adaptations if setup.adaptations else (),
-    )

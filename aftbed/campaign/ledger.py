@@ -13,7 +13,6 @@ import shlex
 import sys
 from collections import Counter
 from collections.abc import Iterable
-from importlib import metadata
 from pathlib import Path
 from typing import Final, TypeVar
 
@@ -68,6 +67,8 @@ def here() -> Environment:
 
 def _packages() -> dict[str, str]:
     """None where aftbed is not installed, but only on the path of Python."""
+    from importlib import metadata  # noqa: PLC0415 - with it comes `threading`, see `worker_pool`
+
     try:
         wanted = [_PACKAGE.match(text) for text in metadata.requires("aftbed") or () if ";" not in text]
         names = sorted(match[0] for match in wanted if match)

@@ -43,7 +43,6 @@ from aftbed.core.errors import ConfigError, FileKeyError, at_key, unknown
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.requirements import check_requirements
 from aftbed.core.script import RECIPES
-from aftbed.core.yaml_file import in_file, read_yaml
 from aftbed.ftm.compose import expressions, is_listed
 from aftbed.functions.request_file import located_requests
 from aftbed.functions.source import located
@@ -214,6 +213,8 @@ def spec_path(name: str) -> Path:
 def read_spec(name: str) -> Spec:
     """The shipped campaign of that name, or a file. Raises ConfigError naming file, line and key."""
     path = spec_path(name)
+    from aftbed.core.yaml_file import in_file, read_yaml  # noqa: PLC0415 - a worker reads no YAML
+
     spec = read_yaml(path, Spec)
     with in_file(path):
         spec = msgspec.structs.replace(spec, system=_located(spec.system, path.parent))

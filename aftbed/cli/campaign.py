@@ -19,9 +19,10 @@ import typer
 from msgspec.structs import asdict, replace
 
 from aftbed.campaign import ledger, runner
-from aftbed.campaign.experiment import REQUESTS_MAX, Result, carry_out, refuse_untrusted, smallest
+from aftbed.campaign.experiment import REQUESTS_MAX, Result, carry_out, refuse_untrusted
 from aftbed.campaign.plan import CampaignPlan, size_of
 from aftbed.campaign.plan import plan as plan_of
+from aftbed.campaign.smallest import smallest
 from aftbed.campaign.spec import EXPERIMENTS_MAX, Spec, check, read_spec, shipped, spec_path
 from aftbed.cli.interrupted import interrupted
 from aftbed.cli.options import (

@@ -8,8 +8,9 @@ from campaigns import written
 from certified import REQUESTS, STRANGERS, requests_in
 from msgspec.structs import replace
 
-from aftbed.campaign.experiment import Experiment, carry_out, setup_of, smallest
+from aftbed.campaign.experiment import Experiment, carry_out, setup_of
 from aftbed.campaign.plan import plan, suited
+from aftbed.campaign.smallest import smallest
 from aftbed.campaign.spec import Spec, read_spec
 from aftbed.cli import campaign as command
 from aftbed.core.application import NONE, Characteristics, approximate

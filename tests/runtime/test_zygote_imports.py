@@ -32,6 +32,17 @@ def test_a_zygote_imports_what_its_processes_need(zygote: str, too: set[str]) ->
     assert ("cantools" in modules) == (zygote == "zygote.bus")
 
 
+def test_a_worker_of_real_experiments_imports_what_they_need() -> None:
+    """Each process of each run is a fork of it: `threading` alone has each do half a millisecond of work."""
+    code = "import sys; from aftbed.campaign import runner; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True)
+    modules = set(done.stdout.split())
+    assert not modules & {*NOT_IN_A_NODE, *OF_THE_BUS, "zipfile"} - {"aftbed.runtime.unix.launch"}
+    rooms = {name.split(".")[1] for name in modules if name.startswith("aftbed.")}
+    assert not rooms & {"cli", "bench", "report", "interop", "search", "api"}
+    assert "aftbed.runtime.sim.world" not in modules
+
+
 def test_the_process_of_a_function_imports_what_executes_it() -> None:
     """Without the reader of records, and the runtime with it, it starts in half the time."""
     code = "import sys, aftbed.judge.execution; print(*sys.modules)"

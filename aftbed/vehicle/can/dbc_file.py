@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import logging
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
@@ -430,6 +429,8 @@ def _essential(text: str) -> list[str]:
 
 def _canmatrix_of(lines: list[str]) -> tuple[canmatrix.CanMatrix, list[int]] | None:
     """What canmatrix makes of the lines, and which of them, by index, it could not read. None: nothing."""
+    import logging  # noqa: PLC0415 - with it comes `threading`, for which each fork has work to do
+
     import canmatrix.formats.dbc as reader  # noqa: PLC0415 - lazily, see above
 
     logging.getLogger("canmatrix").setLevel(logging.CRITICAL)

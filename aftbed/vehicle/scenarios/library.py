@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Final
 
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.yaml_file import in_file, read_yaml
 from aftbed.vehicle.scenarios.scenario import Scenario, ScenarioKeys, scenario_of
 from aftbed.vehicle.scenarios.tables import SEPARATOR, case_scenario
 
@@ -57,6 +56,8 @@ def load_scenario(name_or_path: str) -> Scenario:
         path = _FOLDER / f"{name_or_path}.yaml"
     else:
         raise unknown("scenario", name_or_path, scenario_names())
+    from aftbed.core.yaml_file import in_file, read_yaml  # noqa: PLC0415 - PyYAML costs 15 ms
+
     keys = read_yaml(path, ScenarioKeys)
     with in_file(path):
         return scenario_of(path.stem, keys)

@@ -13,7 +13,6 @@ What a table asks for beside the impact is in the case: how long the warning has
 braking, and how much or how little may be asked of the brakes.
 """
 
-import difflib
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Final, Literal
@@ -22,7 +21,6 @@ import msgspec
 from msgspec import Meta
 
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.yaml_file import read_yaml
 from aftbed.vehicle.plant import VehicleResult
 from aftbed.vehicle.scenarios.scenario import (
     BrakesKeys,
@@ -126,6 +124,8 @@ def case_scenario(name: str) -> Scenario:
     for case in cases(table):
         if case.name == name:
             return _scenario(case, _table(table).groups[case.group])
+    import difflib  # noqa: PLC0415 - for a mistake only
+
     names = [case.name for case in cases(table)]
     near = difflib.get_close_matches(name, names, n=NEAR_NAMES, cutoff=0.0)
     raise ConfigError(
@@ -160,6 +160,8 @@ def colour(impact_kmh: float) -> str:
 def _table(name: str) -> _Table:
     if name not in table_names():
         raise unknown("table", name, table_names())
+    from aftbed.core.yaml_file import read_yaml  # noqa: PLC0415 - PyYAML costs 15 ms
+
     return read_yaml(_FOLDER / f"{name}.yaml", _Table)
 
 
