@@ -35,13 +35,16 @@ EXIT_STATUS: Final = (
 )
 ENVIRONMENT: Final = (
     ("XDG_RUNTIME_DIR", "Runs have their directories below it."),
-    ("TMPDIR", "Where they are if that is not set; /tmp without both."),
+    ("TMPDIR", "Where they are if that is not set; /dev/shm or /tmp without both."),
     ("XDG_STATE_HOME", "Below it aftbed keeps the hashes of functions that this user has run."),
     ("PYTHONPATH", "Where functions of a user are looked for, as Python does."),
     ("NO_COLOR", "If it is set, nothing is coloured."),
 )
 FILES: Final = (
-    ("$XDG_RUNTIME_DIR/aftbed/ID, /tmp/aftbed-UID/ID", "The private directory of a run: its control socket."),
+    (
+        "$XDG_RUNTIME_DIR/aftbed/ID, /dev/shm/aftbed-UID/ID, /tmp/aftbed-UID/ID",
+        "The private directory of a run: its control socket.",
+    ),
     ("DIR of --record", "The record of a run; aftbed check judges it again."),
     ("$XDG_STATE_HOME/aftbed, ~/.local/state/aftbed", "The hashes of what this user has run."),
     ("campaign-NAME", "Plan, ledger, records and reports of a campaign, if --out does not say."),

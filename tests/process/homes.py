@@ -17,12 +17,15 @@ from typing import Final, TypeVar
 
 import pytest
 
+from aftbed.runtime.unix.run_directory import suits
+
 WAIT_SECONDS_MAX: Final = 60.0  # a wait ends with its event: this is for machines under load
 LOOK_SECONDS: Final = 0.005  # between two looks at what no descriptor tells
 GONE_SECONDS_MAX: Final = 1.0  # G7
 PATIENCE_SECONDS: Final = 5.0  # how long a test waits for what G7 allows a second
 FORKED: Final = "/of/the/test"  # the home in the environment of a forked command, which its mapping names
 SHARED_MEMORY: Final = Path("/dev/shm")
+PREFIX: Final = "aft-"
 
 Found = TypeVar("Found")
 
@@ -42,15 +45,18 @@ def _pids() -> set[int]:
 
 
 def _shared_memory() -> set[Path]:
-    """What there is but semaphores: a run has none, and no mapping says whose one is (glibc renames it)."""
-    return {path for path in SHARED_MEMORY.iterdir() if not path.name.startswith("sem.")}
+    """What there is but homes, and semaphores: a run has none, and no mapping says whose one is (glibc
+    renames it).
+    """
+    return {path for path in SHARED_MEMORY.iterdir() if not path.name.startswith(("sem.", PREFIX))}
 
 
 class Home:
     """The XDG_RUNTIME_DIR of one test. Its path is short: a socket's may have 108 bytes."""
 
     def __init__(self) -> None:
-        self.path = Path(tempfile.mkdtemp(prefix="aft-", dir="/tmp"))
+        folder = SHARED_MEMORY if suits(SHARED_MEMORY) else "/tmp"
+        self.path = Path(tempfile.mkdtemp(prefix=PREFIX, dir=folder))
         self._mark = f"XDG_RUNTIME_DIR={self.path}".encode()
         self._before = _pids()
         self._shared = _shared_memory()

@@ -54,6 +54,8 @@ class Row(NamedTuple):
 
 
 PASS: Final = "verdict: pass"
+MEMORY: Final = 'unset XDG_RUNTIME_DIR TMPDIR; mount -t tmpfs -o {} none /dev/shm; "$@" | cat'  # what is left
+RUNS_IN_TMP: Final = "run directory +/tmp/aftbed-"
 ROWS: Final = (
     # places for what a command writes
     Row(
@@ -290,6 +292,16 @@ ROWS: Final = (
         deep=True,
         mounts=True,
     ),
+    Row(
+        "large_shared_memory",
+        MEMORY.format("size=2g"),
+        "doctor",
+        0,
+        "run directory +/dev/shm/aftbed-",
+        mounts=True,
+    ),
+    Row("small_shared_memory", MEMORY.format("size=64m"), "doctor", 0, RUNS_IN_TMP, deep=True, mounts=True),
+    Row("nothing_is_executed_in_it", MEMORY.format("noexec,size=2g"), "doctor", 0, RUNS_IN_TMP, mounts=True),
     # standard streams
     Row("no_stdin", '"$@" <&-', LOAD, 0, PASS, deep=True),
     Row("no_stdout", '"$@" >&-', LOAD, 0, deep=True),

@@ -77,6 +77,24 @@ def test_without_a_runtime_directory_it_lies_under_tmp(
         assert run_directory.root().parent == tmp_path and run_directory.root().name.startswith("aftbed-")
 
 
+@pytest.mark.parametrize(
+    ("folder", "bytes_min", "expected"),
+    [
+        ("", 0, True),
+        ("", 1 << 60, False),  # too small
+        ("nowhere", 0, False),
+    ],
+)
+def test_without_a_temporary_directory_it_lies_in_memory_that_suits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, bytes_min: int, expected: bool
+) -> None:
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    monkeypatch.delenv("TMPDIR", raising=False)
+    monkeypatch.setattr(run_directory, "MEMORY", tmp_path / folder)
+    monkeypatch.setattr(run_directory, "MEMORY_BYTES_MIN", bytes_min)
+    assert run_directory._place() == (tmp_path if expected else Path("/tmp")) / f"aftbed-{os.getuid()}"
+
+
 @pytest.mark.parametrize("wide", [0o755, 0o770, 0o701, 0o777])
 def test_a_directory_that_others_can_enter_is_refused(runtime: Path, wide: int) -> None:
     runtime.mkdir()

@@ -249,7 +249,7 @@ def _record_undo(record: Path, started_ns: int, text: str) -> None:
 #
 # A run is alive while the command that made it lives: no other process can hold the lock of its directory. A
 # process belongs to a run by its mark, never by a name; a directory, by its place among those of this user's
-# runs. Searched are the runs of this user below this `XDG_RUNTIME_DIR` (or `TMPDIR`, or `/tmp`).
+# runs. Searched are the runs of this user below this `XDG_RUNTIME_DIR` (or where they lie without it).
 #
 # After any death the rest of a run has a second to end (G7). So what is found is looked at again until that
 # second has passed, and only what stays is reported: no run that is just beginning or ending.
