@@ -144,7 +144,7 @@ class Supervisor:
         self._shown: object = None  # to the command, of the state
         self._counts_due_ns = 0
         self._graph_ms = 0.0
-        self._waited_ns: dict[int, int] = {}  # for a CPU until the graph was complete, by pid
+        self._waited_first_ns: dict[int, int] = {}  # for a CPU until the graph was complete, by pid
         self._last_look_ns = self._grace_until_ns = 0
         self._lost = False
         # Of the end: `_reason` is None before it, "" for the good one.
@@ -209,7 +209,7 @@ class Supervisor:
             self._finish(f"launch failed: {failure}")
             return
         nodes = self._deployment.nodes.values()
-        self._waited_ns = {process.pid: linux.waited_ns(process.pid) for process in nodes}
+        self._waited_first_ns = {process.pid: linux.waited_ns(process.pid) for process in nodes}
         self._log("started", f"{len(nodes)} nodes in {self._graph_ms:.1f} ms")
         self._controller.inform_recovery(failed=False)
         self._server.launched()
@@ -310,21 +310,21 @@ class Supervisor:
             return
         self._reason = reason
         self._loop.tasks.start("stop", self._work.stop_source(), lambda _: None)
-        self._drain(time.monotonic_ns(), self._waits_ns())
+        self._drain(time.monotonic_ns(), self._waited_now_ns())
 
-    def _drain(self, began_ns: int, waits_ns: dict[int, int]) -> None:
+    def _drain(self, began_ns: int, waited_ns: dict[int, int]) -> None:
         """Wait until all is answered, and what fails or changes has come to its end; or to the limit.
 
-        Of a service that is lost, neither is waited for. `waits_ns`: when this began at `began_ns`.
+        Of a service that is lost, neither is waited for. `waited_ns`: when this began at `began_ns`.
         """
         unrest = self._work.awaits_replies or bool(self._controller.unrest())
         settled = self._work.ended and (self._lost or not unrest)
         command_gone = self._reason == COMMAND_GONE  # no process waits for a verdict
         if settled and self._looks_left:
             ask = self._deployment.ask_states(self._states)
-            self._loop.tasks.start("states", ask, lambda _: self._looked(began_ns, waits_ns))
+            self._loop.tasks.start("states", ask, lambda _: self._looked(began_ns, waited_ns))
             return
-        if command_gone or settled or self._drains_too_long(began_ns, waits_ns):
+        if command_gone or settled or self._drains_too_long(began_ns, waited_ns):
             if not settled and not command_gone:
                 self._unfinished = self._controller.under_way()
             self._controller.ending = True
@@ -332,25 +332,25 @@ class Supervisor:
             return
         if not len(self._loop.tasks):
             self._loop.tasks.start(STATS_TASK, self._work.wind_up(), lambda _: None)
-        self._loop.after(DRAIN_SECONDS, lambda: self._drain(began_ns, waits_ns))
+        self._loop.after(DRAIN_SECONDS, lambda: self._drain(began_ns, waited_ns))
 
-    def _drains_too_long(self, began_ns: int, waits_ns: dict[int, int]) -> bool:
+    def _drains_too_long(self, began_ns: int, waited_ns: dict[int, int]) -> bool:
         seconds = (time.monotonic_ns() - began_ns) / 1e9
         if seconds <= DRAIN_SECONDS_MAX:
             return False
-        waited_ns = [after - waits_ns.get(pid, 0) for pid, after in self._waits_ns().items()]
-        return drains_too_long(seconds, max(waited_ns) / 1e9)
+        since_ns = [now_ns - waited_ns.get(pid, 0) for pid, now_ns in self._waited_now_ns().items()]
+        return drains_too_long(seconds, max(since_ns) / 1e9)
 
-    def _waits_ns(self) -> dict[int, int]:
+    def _waited_now_ns(self) -> dict[int, int]:
         """How long each process of the run has waited for a CPU so far, by pid; this one included."""
         pids = [os.getpid(), *(process.pid for process in self.pool.processes if process.pid)]
         return {pid: linux.waited_ns(pid) for pid in pids}
 
-    def _looked(self, began_ns: int, waits_ns: dict[int, int]) -> None:
+    def _looked(self, began_ns: int, waited_ns: dict[int, int]) -> None:
         """A replica may have yet to apply what was sent to it: look again, for a time."""
         self._looks_left = self._looks_left - 1 if len(set(self._states.values())) > 1 else 0
         pause_s = DRAIN_SECONDS if self._looks_left else 0.0
-        self._loop.after(pause_s, lambda: self._drain(began_ns, waits_ns))
+        self._loop.after(pause_s, lambda: self._drain(began_ns, waited_ns))
 
     @property
     def reason(self) -> str | None:
@@ -361,7 +361,7 @@ class Supervisor:
         """Kill and reap all processes, and report how the run ended."""
         self._write_log()
         living = self._deployment.hosted()
-        waits = [linux.waited_ns(pid) - before for pid, before in self._waited_ns.items()]
+        waits = [linux.waited_ns(pid) - before for pid, before in self._waited_first_ns.items()]
         left = self._kill_all()
         end = {
             "reason": self._reason,
