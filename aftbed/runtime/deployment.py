@@ -323,7 +323,8 @@ class Deployment:
         """Have the nodes of a new backup rehearse. They do not before it is ready: until then a crash of the
         leader ends the service.
         """
-        for node in self.slots[replica].nodes:
+        slot = self.slots.get(replica)  # none if the run has been adapted to a single replica since
+        for node in slot.nodes if slot is not None else ():
             with contextlib.suppress(StepFailed):  # it is dead, and its replica lost
                 kinds = tuple(kind for _, kind in self.process(node).bricks)
                 self.leave(node, control.Rehearse(control.UNANSWERED, kinds))

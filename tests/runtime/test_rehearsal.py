@@ -13,7 +13,7 @@ from aftbed.inject.model import Fault
 from aftbed.runtime import control
 from aftbed.runtime.interface import Process
 from aftbed.runtime.sim.processes import SimProcessPool
-from aftbed.runtime.sim.world import Setup, simulate
+from aftbed.runtime.sim.world import Setup, World, simulate
 
 SCRIPT = """
 import os, resource, sys
@@ -75,6 +75,18 @@ def test_what_waits_for_a_failover_rehearses_and_a_new_backup_when_it_is_ready(
     ]
     (ready,) = run.history.events(Event.BACKUP_READY)
     assert all(t_ns > ready.t_ns for *_, t_ns in later)
+
+
+def test_a_backup_that_is_gone_meanwhile_rehearses_nothing() -> None:
+    """The run was adapted to a single replica while the order was waiting, or the backup is dead again."""
+    world = World(Setup("tr", "process", 1, 3))
+    world.run()
+    deployment = world.controller.deployment
+    assert "b" not in deployment.slots
+    deployment.rehearse("b")
+    for node in deployment.slots["a"].nodes:
+        deployment.process(node).kill()
+    deployment.rehearse("a")
 
 
 REUSES = """
