@@ -240,10 +240,11 @@ class NodeDied(Message, frozen=True, tag=26):
 
 
 class SeenAlive(Message, frozen=True, tag=27):
-    """Host to a Watchdog: when each watched node was last seen alive (monotonic ns), and how much later than
-    it was planned the host looked.
+    """Host to a Watchdog: it looked at `at_ns`, `late_ns` later than planned, and had last seen each watched
+    node alive at `seen_ns` (all monotonic). The Watchdog itself may come to run a good while after `at_ns`.
     """
 
+    at_ns: int
     seen_ns: dict[str, int]
     late_ns: int
 

@@ -46,9 +46,10 @@ class Watchdog(Brick):
     """Reports to Recovery that a node of its replica is dead or hangs. One per replica.
 
     A death comes as a message (the host holds the pidfds). A hang is a node that was not seen alive for
-    `HANG_DEADLINE_NS`. The deadline only counts while this Watchdog itself runs on time: if its host looked
-    late, the machine was stalled, and every node gets the whole deadline again. That keeps a busy machine
-    from a false failover. One suspicion per generation is enough.
+    `HANG_DEADLINE_NS` when the host looked. The deadline only counts while this Watchdog itself runs on time:
+    if its host looked late, the machine was stalled, and every node gets the whole deadline again; and what
+    passes between a look and this step, in which the host may be preempted, does not count at all. That keeps
+    a busy machine from a false failover. One suspicion per generation is enough.
     """
 
     def __init__(self) -> None:
@@ -80,12 +81,13 @@ class Watchdog(Brick):
                 raise PeerError(f"{type(msg).__name__} on {port}")
 
     def _judge(self, seen: SeenAlive, now_ns: int) -> list[Effect]:
+        at_ns = seen.at_ns
         if seen.late_ns > LATE_NS_MAX:
-            self._grace_until_ns = now_ns + HANG_DEADLINE_NS
-        if now_ns < self._grace_until_ns:
+            self._grace_until_ns = at_ns + HANG_DEADLINE_NS
+        if at_ns < self._grace_until_ns:
             return []
         for node in self.nodes:
-            if now_ns - seen.seen_ns.get(node, now_ns) >= HANG_DEADLINE_NS:
+            if at_ns - seen.seen_ns.get(node, at_ns) >= HANG_DEADLINE_NS:
                 return self._suspect(node, "hang", now_ns)
         return []
 

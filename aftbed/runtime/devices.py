@@ -320,7 +320,7 @@ class Sensor(Device):
         planned_ns = self._next_ns or now_ns
         seen_ns, busy = self._senses.look(now_ns)
         self._next_ns = max(planned_ns, now_ns - LOOK_NS) + (LOOK_NS if busy else LOOK_IDLE_NS)
-        return SeenAlive(seen_ns, now_ns - planned_ns)
+        return SeenAlive(now_ns, seen_ns, now_ns - planned_ns)
 
     def quiet(self) -> None:
         self._senses.forget()

@@ -71,7 +71,7 @@ SAMPLES: Final[dict[type, AnyMessage]] = {
         Submit(b"what"),
         Watch("a", 1, ("a/after",)),
         NodeDied("a/after"),
-        SeenAlive({"a/after": 0}, 0),
+        SeenAlive(0, {"a/after": 0}, 0),
         Situation("a", 1, "b", 1, 1, (), False),
         Adapt(1, Script("pbr to lfr", "", (), ())),
         Progress(1, Phase.PREPARE, ""),

@@ -29,7 +29,7 @@ class Watched:
         """A look `passed_ns` later; all nodes are alive except the named ones (`server=...`)."""
         self.now_ns += passed_ns
         seen = {n: silent_since_ns.get(n.partition("/")[2], self.now_ns) for n in NODES}
-        return self.brick.step("sense", SeenAlive(seen, late_ns), self.now_ns)
+        return self.brick.step("sense", SeenAlive(self.now_ns, seen, late_ns), self.now_ns)
 
     def on_time(self, passed_ns: int, **silent_since_ns: int) -> list[Effect]:
         """The same, but with all the looks between, each on time; what came of them."""
@@ -99,10 +99,18 @@ def test_how_late_is_late(late_ns: int, alarms: int) -> None:
     assert len(sends(effects)) == alarms
 
 
+def test_a_watchdog_that_is_preempted_between_the_look_and_its_step_suspects_nobody() -> None:
+    watched = Watched()
+    watched.on_time(2 * HANG_DEADLINE_NS)
+    looked_ns = watched.now_ns
+    seen = SeenAlive(looked_ns, dict.fromkeys(NODES, looked_ns), 0)
+    assert watched.brick.step("sense", seen, looked_ns + 10 * HANG_DEADLINE_NS) == []
+
+
 def test_a_node_that_was_not_looked_at_yet_does_not_hang() -> None:
     watched = Watched()
     watched.on_time(2 * HANG_DEADLINE_NS)
-    assert watched.brick.step("sense", SeenAlive({}, 0), watched.now_ns) == []
+    assert watched.brick.step("sense", SeenAlive(watched.now_ns, {}, 0), watched.now_ns) == []
 
 
 def test_a_new_recovery_is_told_what_the_old_one_was() -> None:

@@ -205,6 +205,15 @@ MUTANTS: Final = (
         SCRIPTS,
     ),
     SourceMutant(
+        "a Watchdog counts what passes between the look at a node and its own step",
+        "G5",
+        f"{FTM}/failover.py",
+        "at_ns = seen.at_ns",
+        "at_ns = now_ns",
+        UNIT,
+        ("tests/ftm/test_watchdog.py",),
+    ),
+    SourceMutant(
         "a Watchdog that dies while it is put in place stays away",
         "G5",
         f"{RUNTIME}/run_controller.py",
