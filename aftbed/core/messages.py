@@ -28,6 +28,13 @@ class Traffic(Enum):
     CONTROL = "control"
 
 
+class Loss(Enum):
+    """How a replica was lost. What hangs may go on; what crashed does not."""
+
+    CRASH = "crash"
+    HANG = "hang"
+
+
 class Message(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """Base of all messages: an array on the wire, its tag first."""
 
@@ -143,7 +150,7 @@ class Suspect(Message, frozen=True, tag=10):
     replica: str
     generation: int
     node: str
-    cause: str
+    cause: Loss
     at_ns: int
 
 

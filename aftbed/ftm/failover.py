@@ -4,22 +4,26 @@ Paper, III-A: the Watchdog's alarm makes Recovery promote the backup. Recovery's
 the situation that the runtime reports and of the suspicions against it. So a Recovery that died in the middle
 of a failover is replaced by one that knows as much.
 
-| leader    | backup            | script                          |
-|-----------|-------------------|---------------------------------|
-| suspected | there             | failover: the backup leads      |
-| any       | suspected         | drop backup: the leader alone   |
-| sound     | none, slot vacant | new backup, by state transfer   |
+| leader             | backup            | script                        |
+|--------------------|-------------------|-------------------------------|
+| suspected          | there             | failover: the backup leads    |
+| any                | suspected         | drop backup: the leader alone |
+| sound, or has hung | none, slot vacant | new backup, by state transfer |
+
+A leader that has hung may serve again by now. If it answers the script for a new backup, the failover to that
+backup follows, since the suspicion stands; if it does not, the script fails.
 
 By which ports a leader sends to its backup, and whose state a new backup needs, depends on the mechanism:
 the situation has both. Without such a port there is one replica, and nothing to be done about its death.
 """
 
+from collections.abc import Mapping
 from typing import Final
 
 from aftbed.core.brick import Brick, Effect, Note, Order, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
-from aftbed.core.messages import AnyMessage, NodeDied, Rebound, SeenAlive, Situation, Suspect, Watch
+from aftbed.core.messages import AnyMessage, Loss, NodeDied, Rebound, SeenAlive, Situation, Suspect, Watch
 from aftbed.core.script import (
     Attach,
     Bind,
@@ -72,7 +76,7 @@ class Watchdog(Brick):
                 self._grace_until_ns = now_ns + HANG_DEADLINE_NS
                 return []
             case NodeDied():
-                return self._suspect(msg.node, "crash", now_ns) if msg.node in self.nodes else []
+                return self._suspect(msg.node, Loss.CRASH, now_ns) if msg.node in self.nodes else []
             case SeenAlive():
                 return self._judge(msg, now_ns)
             case Rebound():  # a new Recovery, which knows of no suspicion yet
@@ -88,10 +92,10 @@ class Watchdog(Brick):
             return []
         for node in self.nodes:
             if at_ns - seen.seen_ns.get(node, at_ns) >= HANG_DEADLINE_NS:
-                return self._suspect(node, "hang", now_ns)
+                return self._suspect(node, Loss.HANG, now_ns)
         return []
 
-    def _suspect(self, node: str, cause: str, now_ns: int) -> list[Effect]:
+    def _suspect(self, node: str, cause: Loss, now_ns: int) -> list[Effect]:
         if self.suspect is not None:
             return []
         self.suspect = Suspect(self.replica, self.generation, node, cause, now_ns)
@@ -105,6 +109,7 @@ _ALARM_PORTS: Final = ("wdg2rec", "wdg2rec.b")
 FAILURES_MAX: Final = 5  # scripts for a new backup that may fail in a row before Recovery gives up
 RETRY_NS: Final = 50_000_000
 
+Suspicions = Mapping[tuple[str, int], Loss]  # of a generation of a replica
 Ports = tuple[tuple[str, str], ...]  # parts of the leader, each with its port to the same part of the backup
 
 
@@ -137,15 +142,16 @@ def new_backup(leader: str, replica: str, replication: Ports, stateful: tuple[st
     )
 
 
-def decide(now: Situation, suspects: set[tuple[str, int]]) -> Script | None:
+def decide(now: Situation, suspects: Suspicions) -> Script | None:
     """The script that the table of the module asks for, or None."""
     if not now.leader or not now.replication:
         return None
-    if now.backup and (now.backup, now.backup_generation) in suspects:
-        return drop_backup(now.leader, now.backup, now.replication)
-    if (now.leader, now.leader_generation) in suspects:
-        return failover(now.leader, now.backup, now.epoch + 1) if now.backup else None
-    if not now.backup and now.vacant:
+    of_leader = suspects.get((now.leader, now.leader_generation))
+    if now.backup:
+        if (now.backup, now.backup_generation) in suspects:
+            return drop_backup(now.leader, now.backup, now.replication)
+        return failover(now.leader, now.backup, now.epoch + 1) if of_leader else None
+    if now.vacant and of_leader is not Loss.CRASH:
         return new_backup(now.leader, now.vacant[0], now.replication, now.stateful)
     return None
 
@@ -155,7 +161,7 @@ class Recovery(Brick):
 
     def __init__(self) -> None:
         self.situation: Situation | None = None
-        self.suspects: set[tuple[str, int]] = set()
+        self.suspects: dict[tuple[str, int], Loss] = {}
         self.ordered: Script | None = None
         self._failures = 0
         self._retry_ns: int | None = None
@@ -169,7 +175,7 @@ class Recovery(Brick):
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
         match msg:
             case Suspect():
-                self.suspects.add((msg.replica, msg.generation))
+                self.suspects[msg.replica, msg.generation] = msg.cause
                 return self._order(now_ns)
             case Situation():
                 return self._update(msg, now_ns)
@@ -180,8 +186,9 @@ class Recovery(Brick):
 
     def _update(self, msg: Situation, now_ns: int) -> list[Effect]:
         done, self.ordered, self.situation = self.ordered, None, msg
-        present = {(msg.leader, msg.leader_generation), (msg.backup, msg.backup_generation)}
-        self.suspects = {s for s in present if s in self.suspects or s[0] in msg.lost}
+        present = ((msg.leader, msg.leader_generation), (msg.backup, msg.backup_generation))
+        dead = {one: Loss.CRASH for one in present if one[0] in msg.lost}
+        self.suspects = {one: self.suspects[one] for one in present if one in self.suspects} | dead
         self._failures = self._failures + 1 if msg.failed else 0
         notes: list[Effect] = []
         if done is not None and not msg.failed:

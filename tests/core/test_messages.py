@@ -12,6 +12,7 @@ from aftbed.core.errors import PeerError
 from aftbed.core.messages import (
     AnyMessage,
     Checkpoint,
+    Loss,
     Message,
     Pages,
     Reply,
@@ -40,6 +41,7 @@ BY_TYPE: Final = {
     State: st.one_of(st.binary(max_size=300), some_pages),
     str: st.text(max_size=40),
     bool: st.booleans(),
+    Loss: st.sampled_from(Loss),
     tuple[Tried, ...]: st.lists(
         st.builds(Tried, numbers, numbers, numbers, st.binary(max_size=99), st.binary(max_size=99)),
         max_size=3,
@@ -130,7 +132,7 @@ def test_a_well_formed_value_that_is_no_message_is_refused(value: object) -> Non
 
 
 def test_text_that_is_no_text_is_refused() -> None:
-    packet = messages.encode(Suspect("a", 1, "node", "crash", 5)).replace(b"node", b"\xff\xff\xff\xff")
+    packet = messages.encode(Suspect("a", 1, "node", Loss.CRASH, 5)).replace(b"node", b"\xff\xff\xff\xff")
     with pytest.raises(PeerError, match="not a message"):
         messages.decode(packet)
 

@@ -9,7 +9,7 @@ from samples import notes
 from aftbed.adapt.script_check import problems
 from aftbed.core.brick import CONTROL, Effect, Order
 from aftbed.core.events import Event
-from aftbed.core.messages import Rebound, Situation, Suspect
+from aftbed.core.messages import Loss, Rebound, Situation, Suspect
 from aftbed.core.script import (
     Attach,
     Bind,
@@ -23,7 +23,16 @@ from aftbed.core.script import (
     Transfer,
     Unbind,
 )
-from aftbed.ftm.failover import FAILURES_MAX, RETRY_NS, Recovery, decide, drop_backup, failover, new_backup
+from aftbed.ftm.failover import (
+    FAILURES_MAX,
+    RETRY_NS,
+    Recovery,
+    Suspicions,
+    decide,
+    drop_backup,
+    failover,
+    new_backup,
+)
 
 PBR: Final = (("after", "aft2aft"),)
 LFR: Final = (("before", "bfr2bfr"), ("after", "aft2aft"))
@@ -50,27 +59,27 @@ def ordered(effects: list[Effect]) -> list[Script]:
 
 
 def alarm(replica: str, generation: int = 1) -> Suspect:
-    return Suspect(replica, generation, f"{replica}/server", "crash", 5)
+    return Suspect(replica, generation, f"{replica}/server", Loss.CRASH, 5)
 
 
 @pytest.mark.parametrize(
     ("situation", "suspects", "script"),
     [
-        (WHOLE, set(), None),
-        (WHOLE, {("a", 1)}, failover("a", "b", 2)),
-        (WHOLE, {("b", 1)}, dropped()),
-        (WHOLE, {("a", 1), ("b", 1)}, dropped()),
-        (WHOLE, {("a", 2)}, None),  # another generation's
-        (ALONE, set(), renewed("a", "b")),
-        (ALONE, {("a", 1)}, None),  # no replica is left to take over
-        (Situation("a", 1, "", 0, 1, (), False), set(), None),  # the slot is not free yet
-        (Situation("b", 3, "a", 2, 5, (), False), {("b", 3)}, failover("b", "a", 6)),
-        (NOBODY, set(), None),
+        (WHOLE, {}, None),
+        (WHOLE, {("a", 1): Loss.CRASH}, failover("a", "b", 2)),
+        (WHOLE, {("a", 1): Loss.HANG}, failover("a", "b", 2)),
+        (WHOLE, {("b", 1): Loss.CRASH}, dropped()),
+        (WHOLE, {("a", 1): Loss.HANG, ("b", 1): Loss.HANG}, dropped()),
+        (WHOLE, {("a", 2): Loss.CRASH}, None),  # another generation's
+        (ALONE, {}, renewed("a", "b")),
+        (ALONE, {("a", 1): Loss.CRASH}, None),  # no replica is left to take over
+        (ALONE, {("a", 1): Loss.HANG}, renewed("a", "b")),  # it may serve again
+        (Situation("a", 1, "", 0, 1, (), False), {}, None),  # the slot is not free yet
+        (Situation("b", 3, "a", 2, 5, (), False), {("b", 3): Loss.CRASH}, failover("b", "a", 6)),
+        (NOBODY, {}, None),
     ],
 )
-def test_the_table_of_decisions(
-    situation: Situation, suspects: set[tuple[str, int]], script: Script | None
-) -> None:
+def test_the_table_of_decisions(situation: Situation, suspects: Suspicions, script: Script | None) -> None:
     assert decide(situation, suspects) == script
 
 
@@ -93,14 +102,14 @@ def test_a_new_backup_gets_all_state_while_the_leader_is_suspended() -> None:
 
 def test_what_a_leader_says_to_its_backup_is_bound_and_unbound_as_the_mechanism_has_it() -> None:
     lfr = msgspec.structs.replace(WHOLE, replication=LFR)
-    script = decide(lfr, {("b", 1)})
+    script = decide(lfr, {("b", 1): Loss.CRASH})
     assert script is not None and script.commit == (
         Fence("b"),
         Unbind("a/before", "bfr2bfr"),
         Unbind("a/after", "aft2aft"),
         Kill("b"),
     )
-    script = decide(msgspec.structs.replace(ALONE, replication=LFR, stateful=("server",)), set())
+    script = decide(msgspec.structs.replace(ALONE, replication=LFR, stateful=("server",)), {})
     assert script is not None and script.commit == (
         Suspend("a/protocol"),
         Transfer("a/server", "b/server"),
@@ -112,10 +121,8 @@ def test_what_a_leader_says_to_its_backup_is_bound_and_unbound_as_the_mechanism_
 
 
 @pytest.mark.parametrize("situation", [WHOLE, ALONE, Situation("a", 1, "", 0, 1, (), False)])
-@pytest.mark.parametrize("suspects", [set(), {("a", 1)}, {("b", 1)}])
-def test_with_one_replica_there_is_nothing_to_do(
-    situation: Situation, suspects: set[tuple[str, int]]
-) -> None:
+@pytest.mark.parametrize("suspects", [{}, {("a", 1): Loss.HANG}, {("b", 1): Loss.CRASH}])
+def test_with_one_replica_there_is_nothing_to_do(situation: Situation, suspects: Suspicions) -> None:
     assert decide(msgspec.structs.replace(situation, replication=()), suspects) is None
 
 
@@ -131,6 +138,18 @@ def test_an_alarm_makes_it_act_and_the_report_ends_it() -> None:
     effects = brick.step(CONTROL, Situation("b", 1, "a", 2, 2, (), False), 0)
     assert notes(effects) == [Event.BACKUP_READY] and ordered(effects) == []
     assert brick.quiescent()
+
+
+def test_two_replicas_that_hung_for_a_while_are_both_replaced() -> None:
+    """The backup at once; the leader, if it answers again, when there is a new backup to lead."""
+    brick = Recovery()
+    brick.step(CONTROL, WHOLE, 0)
+    for replica in ("a", "b"):
+        brick.step("wdg2rec", Suspect(replica, 1, f"{replica}/server", Loss.HANG, 5), 0)
+    assert ordered(brick.step(CONTROL, WHOLE, 0)) == [dropped()], "no failover could begin meanwhile"
+    assert ordered(brick.step(CONTROL, ALONE, 0)) == [renewed("a", "b")]
+    again = Situation("a", 1, "b", 2, 1, (), False)
+    assert ordered(brick.step(CONTROL, again, 0)) == [failover("a", "b", 2)]
 
 
 @pytest.mark.parametrize(("lost", "script"), [("a", failover("a", "b", 2)), ("b", dropped())])
@@ -153,7 +172,7 @@ def test_an_alarm_against_the_past_is_forgotten() -> None:
     brick.step(CONTROL, WHOLE, 0)
     assert ordered(brick.step("wdg2rec", alarm("a", 7), 0)) == []
     brick.step(CONTROL, WHOLE, 0)
-    assert brick.suspects == set()
+    assert brick.suspects == {}
 
 
 def test_an_alarm_that_comes_before_the_situation_waits_for_it() -> None:

@@ -7,7 +7,7 @@ from samples import notes, sends
 
 from aftbed.core.brick import CONTROL, Effect
 from aftbed.core.events import Event
-from aftbed.core.messages import NodeDied, Rebound, SeenAlive, Suspect, Watch
+from aftbed.core.messages import Loss, NodeDied, Rebound, SeenAlive, Suspect, Watch
 from aftbed.ftm.failover import HANG_DEADLINE_NS, LATE_NS_MAX, Watchdog
 from aftbed.runtime.devices import LOOK_NS
 
@@ -42,7 +42,7 @@ class Watched:
 def test_a_death_is_told_at_once() -> None:
     watched = Watched()
     effects = watched.brick.step("sense", NodeDied("a/server"), START_NS + 5)
-    assert sends(effects) == [("wdg2rec", Suspect("a", 1, "a/server", "crash", START_NS + 5))]
+    assert sends(effects) == [("wdg2rec", Suspect("a", 1, "a/server", Loss.CRASH, START_NS + 5))]
     assert notes(effects) == [Event.WATCHDOG_SUSPECT]
 
 
@@ -58,7 +58,7 @@ def test_one_suspicion_per_generation_is_enough() -> None:
     assert watched.on_time(10 * HANG_DEADLINE_NS, server=START_NS) == []
     watched.watch(generation=2)
     effects = watched.brick.step("sense", NodeDied("a/server"), START_NS)
-    assert [m for _, m in sends(effects)] == [Suspect("a", 2, "a/server", "crash", START_NS)]
+    assert [m for _, m in sends(effects)] == [Suspect("a", 2, "a/server", Loss.CRASH, START_NS)]
 
 
 def test_a_node_that_is_silent_past_the_deadline_hangs() -> None:
@@ -68,7 +68,7 @@ def test_a_node_that_is_silent_past_the_deadline_hangs() -> None:
     assert watched.on_time(HANG_DEADLINE_NS - LOOK_NS, server=silent_ns) == []
     assert watched.after(LOOK_NS - 1, server=silent_ns) == []
     effects = watched.after(1, server=silent_ns)
-    assert [m for _, m in sends(effects)] == [Suspect("a", 1, "a/server", "hang", watched.now_ns)]
+    assert [m for _, m in sends(effects)] == [Suspect("a", 1, "a/server", Loss.HANG, watched.now_ns)]
 
 
 def test_a_node_that_is_seen_alive_does_not_hang() -> None:

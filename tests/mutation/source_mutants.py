@@ -214,6 +214,15 @@ MUTANTS: Final = (
         ("tests/ftm/test_watchdog.py",),
     ),
     SourceMutant(
+        "a leader that hung for a while, and whose backup did, too, gets no new one",
+        "G5",
+        f"{FTM}/failover.py",
+        "if now.vacant and of_leader is not Loss.CRASH:",
+        "if now.vacant and not of_leader:",
+        UNIT,
+        ("tests/ftm/test_recovery.py",),
+    ),
+    SourceMutant(
         "a Watchdog that dies while it is put in place stays away",
         "G5",
         f"{RUNTIME}/run_controller.py",

@@ -219,7 +219,7 @@ def words(message: Message) -> str:
     """A message, as short as it can be."""
     match message:
         case Suspect(node=node, cause=cause):
-            about = f"{node} {cause}"
+            about = f"{node} {cause.value}"
         case TakeOver(epoch=epoch):
             about = f"epoch {epoch}"
         case Trial(request_id=number, rerun=True):
