@@ -397,7 +397,7 @@ def half_a_graph(hosted: Hosted, expected: str) -> list[str]:
     if hosted.ftm != expected:
         return [f"{hosted.ftm} runs, though the adaptations came to {expected}"]
     duplex = bool(replication_of(expected))
-    whole = build(expected, hosted.placement, hosted.leader if duplex else "a")
+    whole = build(expected, hosted.placement, hosted.leader)
     joining = "" if hosted.backup or not duplex else ("b" if hosted.leader == "a" else "a")
     return [r for r in missing(hosted.bricks, whole) if not joining or not r.startswith(f"{joining}/")]
 

@@ -24,7 +24,7 @@ from aftbed.judge.reference import reference_run, succession
 from aftbed.judge.verdict import Breach, Verdict, Word, broken, judge
 from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.sim.clock import START_NS
-from aftbed.runtime.sim.world import FUNCTION, Run
+from aftbed.runtime.sim.world import FUNCTION, Run, StruckNode
 from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
 
 # Events of faults that no mechanism outvotes: bits of a checkpoint, or of a reply that is kept.
@@ -34,6 +34,7 @@ UNPROMISED_VALUES: Final = frozenset(
     + (Event.CHECKPOINT_APPLIED, Event.REPLY_STORED, Event.DEDUPE_HIT)
 )
 HARMLESS: Final = (Crash, Hang, Slow)  # kinds of faults that alter no message and no state
+SHORT_HANG_MS: Final = 200  # each step of a script waits longer
 SINGLE: Final = "single"  # the node of that placement hosts both replicas
 
 
@@ -71,14 +72,17 @@ def record_of(run: Run) -> RunRecord:
             for _, event, text in run.logged
             if event == FUNCTION
         ),
-        excuses=Excuses(service_struck_down(run), values, tuple(name for _, name in run.struck)),
+        excuses=Excuses(service_struck_down(run), values, tuple(one.node for one in run.struck)),
         given=given.requests if given is not None else None,
         expected=given.expected if given is not None else None,
     )
 
 
 def service_struck_down(run: Run) -> bool:
-    """Whether faults struck each replica, the second before redundancy was back from the first."""
+    """Whether faults struck each replica, the second before redundancy was back from the first.
+
+    Of two short hangs both replicas recover.
+    """
     replicas = {b.replica for b in run.rest.graph.bricks if b.replica and b.part == "server"}
     renewed = [
         (s.began_ns, s.ended_ns)
@@ -86,20 +90,26 @@ def service_struck_down(run: Run) -> bool:
         if s.kind is ScriptKind.NEW_BACKUP and s.ended_ns and not s.failure
     ]
     # What is staged, and what was exchanged and may have to come back, is a part of its replica.
-    named = sorted((t_ns, replica_of(name.removesuffix(STAGED))) for t_ns, name in run.struck)
-    strikes = [(t_ns, replica) for t_ns, replica in named if replica]
+    named = [(replica_of(one.node.removesuffix(STAGED)), one) for one in sorted(run.struck)]
+    strikes = [(replica, one) for replica, one in named if replica]
     # Supervision stops what a fault has made late. Where there is another replica, that one has to serve.
     late = supervised(run) and bool(run.setup.faults)
     stopped = [r.node for r in run.history.events(Event.DETECTED_STOP)] if late else []
-    if SINGLE in (*(name for _, name in run.struck), *stopped):
+    if SINGLE in (*(one.node for one in run.struck if not _is_short(one)), *stopped):
         return True
     simplex = any(a.goal.expression and not replication_of(a.goal.expression) for a in run.setup.adaptations)
     if len(replicas) < 2 or simplex:  # for a time there may have been one replica only
-        return bool(strikes or stopped)
+        return bool(stopped) or not all(_is_short(one) for _, one in strikes)
     return any(
-        other != replica and not any(first_ns < began and done < second_ns for began, done in renewed)
-        for (first_ns, replica), (second_ns, other) in itertools.combinations(strikes, 2)
+        other != replica
+        and not (_is_short(first) and _is_short(second))
+        and not any(first.t_ns < began and done < second.t_ns for began, done in renewed)
+        for (replica, first), (other, second) in itertools.combinations(strikes, 2)
     )
+
+
+def _is_short(one: StruckNode) -> bool:
+    return 0 < one.for_ms <= SHORT_HANG_MS
 
 
 def evidence_of_run(

@@ -471,9 +471,10 @@ class Execution:
         yield Wait(frozenset())
 
     def can_go_back(self, without: str) -> bool:
-        """Whether what is replaced lives, but for that replica's, and can take the state."""
+        """Whether the old graph has another replica, what is replaced of it lives, and can take the state."""
+        others = any(b.part == "server" and b.replica != without for b in self.old.bricks)
         replaced = self._replaced.items()
-        return not self._one_way and all(p.alive for n, p in replaced if replica_of(n) != without)
+        return others and not self._one_way and all(p.alive for n, p in replaced if replica_of(n) != without)
 
     def _enter(self) -> Keys:
         self._number += 1

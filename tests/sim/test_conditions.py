@@ -37,7 +37,7 @@ def test_a_crash_strikes_at_the_step_of_its_condition(ftm: str, placement: str) 
     run = drive("crash primary when ttc < 2", ftm=ftm, placement=placement)
     words = FaultReport("crash primary when ttc < 2", ReceiptState.ACTIVATED, "ttc < 2 at 2.000000 s")
     assert run.faults == (words,)
-    died_ns = {t_ns for t_ns, _ in run.struck}
+    died_ns = {one.t_ns for one in run.struck}
     step_ns = began_ns(run) + HELD_US * 1000
     assert step_ns < min(died_ns) <= max(died_ns) < step_ns + SOON_NS
     assert run.rest.leader == "b" and run.rest.why_not == ()

@@ -139,7 +139,7 @@ def test_a_replica_may_die_between_any_two_effects(
     setup = Setup(ftm, placement, seed, count)
     world, run = played(replace(setup, dooms=(doomed(setup, parts[part % len(parts)], at),)))
     assert_promises(world, run)
-    died = any(name.startswith(role) for _, name in run.struck)
+    died = any(one.node.startswith(role) for one in run.struck)
     assert run.rest.leader == ("b" if died and role == "a" else "a")
     assert world.controller.deployment.epoch == (2 if died and role == "a" else 1)
 

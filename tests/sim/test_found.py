@@ -11,7 +11,8 @@ from aftbed.inject.grammar import Bit, Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault
 from aftbed.inject.value import ValueFlip, ValuePlace
-from aftbed.runtime.sim.world import Setup
+from aftbed.judge.simulated import breaches
+from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.search.explore import attempt
 
 AT_MS: Final = 5.0
@@ -25,6 +26,14 @@ def dies(target: str, after_ms: float) -> Fault:
 def wanted(expression: str) -> tuple[Scheduled, ...]:
     """An adaptation at `AT_MS`."""
     return (Scheduled(Goal(expression=expression), after_ms=AT_MS),)
+
+
+def wanted_at(expression: str, request: int) -> tuple[Scheduled, ...]:
+    return (Scheduled(Goal(expression=expression), at_request=request),)
+
+
+def hangs(target: str, for_ms: int, event: str, nth: int) -> Fault:
+    return Fault(Hang(for_ms), target, Trigger(event, nth))
 
 
 FOUND: Final = {
@@ -98,6 +107,28 @@ FOUND: Final = {
         faults=(Fault(Crash(), "recovery", Trigger("adapt.step.enter", 3)),),
         adaptations=(Scheduled(Goal(expression="tr"), 4),),
     ),
+    # Both replicas are suspected: one is given up, and the other one got no backup for ever.
+    "two hangs": Setup(
+        "pbr",
+        count=100,
+        rate_hz=500.0,
+        faults=(hangs("backup", 120, "request.sent", 29), hangs("primary", 120, "request.sent", 30)),
+    ),
+    # The way back from two replicas to one, which is the one that hangs: it lost what was under way there.
+    "the only replica of the old graph": Setup(
+        "tr",
+        count=66,
+        rate_hz=497.0,
+        faults=(hangs("primary", 65, "server.enter", 130),),
+        adaptations=wanted_at("pbr", 62),
+    ),
+    # After a failover to `b`, one replica alone is `b`: the judge asked for `a`.
+    "one replica alone behind a failover": Setup(
+        "pbr",
+        count=2,
+        faults=(hangs("primary", 50, "server.enter", 1),),
+        adaptations=wanted_at("assert+tr", 2),
+    ),
 }
 
 
@@ -105,3 +136,12 @@ FOUND: Final = {
 def test_it_is_mended(name: str) -> None:
     _, broken = attempt(FOUND[name])
     assert broken == ()
+
+
+def test_a_leader_that_dies_while_the_way_from_one_replica_to_two_is_observed_is_failed_over_from() -> None:
+    """The judge excuses the loss of one that was alone for a time; here it need not be lost."""
+    fault = Fault(Crash(), "primary", Trigger("server.enter", 130))
+    run = simulate(Setup("tr", count=66, rate_hz=497.0, faults=(fault,), adaptations=wanted_at("pbr", 62)))
+    assert (run.rest.lost, run.rest.leader) == (False, "b")
+    assert [one.outcome for one in run.adaptations] == ["done"]
+    assert breaches(run) == ()

@@ -30,7 +30,7 @@ from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
 from aftbed.judge.simulated import breaches
 from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.sim.processes import SimProcess
-from aftbed.runtime.sim.world import Setup, World
+from aftbed.runtime.sim.world import Setup, StruckNode, World
 
 REQUESTS: Final = 96
 RATES_HZ: Final = (500.0, 2000.0)
@@ -113,7 +113,7 @@ class Interference(RuleBasedStateMachine):
         watchdog = self.world.controller.deployment.nodes.get(f"{replica}/watchdog")
         if not replica or not isinstance(watchdog, SimProcess) or watchdog.dead or watchdog.node is None:
             return
-        self.world.struck.append((self.world.loop.ns, name))  # as good as
+        self.world.struck.append(StruckNode(self.world.loop.ns, name))  # as good as
         watchdog.node.step(watchdog.node.bricks[watchdog.name], "sense", NodeDied(name))
 
     @precondition(lambda self: self._votes and self._sent() - self._flipped_at >= FLIPS_APART)

@@ -20,11 +20,11 @@ from aftbed.inject.receipts import ReceiptState
 from aftbed.inject.value import ValuePlace
 from aftbed.judge.checks import half_a_graph, missing
 from aftbed.judge.outcome import outcome_of
-from aftbed.judge.simulated import breaches, record_of, service_struck_down
+from aftbed.judge.simulated import SHORT_HANG_MS, breaches, record_of, service_struck_down
 from aftbed.judge.verdict import evidence_of, judge
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.run_controller import ScriptRun
-from aftbed.runtime.sim.world import Run, Setup, simulate
+from aftbed.runtime.sim.world import Run, Setup, StruckNode, simulate
 from aftbed.vehicle.aeb.function import default_application
 
 Broken = Callable[[Run], Run]
@@ -84,9 +84,11 @@ def adapted(*outcomes: Outcome) -> Broken:
     return lambda run: replace(run, adaptations=outcomes)
 
 
-def struck(*names: str) -> Broken:
-    """Faults struck these, one each millisecond."""
-    return lambda run: replace(run, struck=tuple((n * MS, name) for n, name in enumerate(names, 1)))
+def struck(*names: str, for_ms: int = 0) -> Broken:
+    """Faults struck these, one each millisecond; stops of `for_ms`, or for good."""
+    return lambda run: replace(
+        run, struck=tuple(StruckNode(n * MS, name, for_ms) for n, name in enumerate(names, 1))
+    )
 
 
 def renewed(ms: float) -> Broken:
@@ -242,6 +244,8 @@ def test_a_service_is_not_lost_in_vain() -> None:
         (all_of(struck("a", "b"), renewed(2.5)), True),  # too late
         (all_of(struck("a", "b", "a"), renewed(1.5)), True),  # the second pair of strikes
         (all_of(struck("a", "b", "a"), renewed(1.5), renewed(2.5)), False),
+        (struck("a", "b", for_ms=SHORT_HANG_MS), False),  # both go on
+        (struck("a", "b", for_ms=SHORT_HANG_MS + 1), True),
     ],
 )
 def test_a_duplex_is_struck_down_by_two_faults_with_no_redundancy_between(broken: Broken, down: bool) -> None:
@@ -251,6 +255,7 @@ def test_a_duplex_is_struck_down_by_two_faults_with_no_redundancy_between(broken
 def test_a_single_replica_is_struck_down_by_one_fault() -> None:
     assert not service_struck_down(struck("client", "a/watchdog")(SIMPLEX))
     assert service_struck_down(struck("a/server")(SIMPLEX))
+    assert not service_struck_down(struck("a/server", for_ms=SHORT_HANG_MS)(SIMPLEX))
 
 
 def test_what_lives_must_be_the_graph_of_who_leads() -> None:
@@ -260,6 +265,15 @@ def test_what_lives_must_be_the_graph_of_who_leads() -> None:
     switched = replace(begun, ftm="lfr", bricks=bricks_of("lfr"))
     assert half_a_graph(switched, "lfr") == []
     assert half_a_graph(replace(begun, ftm="lfr"), "lfr")[0] == "a/after (lfr.after) is missing"
+
+
+def test_after_a_failover_one_replica_alone_is_that_which_leads() -> None:
+    """An adaptation to a mechanism of one replica leaves it where it is."""
+    graph = build("assert", "process", "b")
+    alone = tuple((brick.name, brick.kind) for brick in graph.bricks)
+    hosted = replace(UNBROKEN.rest.hosted, ftm="assert", leader="b", backup="", bricks=alone)
+    assert half_a_graph(hosted, "assert") == []
+    assert half_a_graph(replace(hosted, leader="a"), "assert")[0] == "a/after (assert.after) is missing"
 
 
 def test_of_a_survivor_alone_only_its_own_replica_is_asked_for() -> None:

@@ -131,9 +131,9 @@ class Whiteboard(World):
             self.say(process.name, "dies" + (f": {reason.partition(': ')[2]}" if ": " in reason else ""))
             ended(process, reason)
 
-        def on_freeze(process: SimProcess) -> None:
+        def on_freeze(process: SimProcess, for_ms: int) -> None:
             self.say(process.name, "stops where it is")
-            frozen(process)
+            frozen(process, for_ms)
 
         pool.on_report, pool.on_end, pool.on_freeze = on_report, on_end, on_freeze
 

@@ -82,13 +82,13 @@ class SimProcess:
         return True
 
     def freeze(self, for_ms: int = 0) -> bool:
-        """Stop it at once. `for_ms` is not used: the simulated executive does not die."""
+        """Stop it at once. It is not continued after `for_ms`: the simulated executive does not die."""
         if self.dead:
             return False
         self._still = True
         if self.io is not None:
             self.io.freeze()
-        self._pool.on_freeze(self)
+        self._pool.on_freeze(self, for_ms)
         return True
 
     def thaw(self) -> bool:
@@ -247,7 +247,7 @@ class SimProcessPool:
         self.on_report: Callable[[SimProcess, control.FromNode], None] = lambda process, report: None
         self.on_death: Callable[[SimProcess], None] = lambda process: None
         self.on_end: Callable[[SimProcess, str], None] = lambda process, reason: None
-        self.on_freeze: Callable[[SimProcess], None] = lambda process: None
+        self.on_freeze: Callable[[SimProcess, int], None] = lambda process, for_ms: None
 
     def rouse_ns(self) -> int:
         """Extra delay of a report, in ns, because the executive may sleep."""

@@ -62,7 +62,7 @@ def traced(setup: Setup, make: MakeSetting | None = None, code: Code = NO_CODE) 
     """Run `setup` and keep all that happens; `make` makes other bricks than the catalog's."""
     world = _Traced(setup, make, code)
     run = world.run()
-    struck = [LoggedLine(t_ns, STRUCK, node) for t_ns, node in run.struck]
+    struck = [LoggedLine(one.t_ns, STRUCK, one.node) for one in run.struck]
     sources: tuple[list[Happening], ...] = (world.happened, [*run.history.journals[EXECUTIVE]], [*struck])
     return Trace(run, tuple(merge(*sources, key=lambda one: one.t_ns)))
 

@@ -9,7 +9,7 @@ import contextlib
 from collections.abc import Callable, Iterable
 from functools import lru_cache
 from random import Random
-from typing import Final, NoReturn
+from typing import Final, NamedTuple, NoReturn
 
 import msgspec
 
@@ -105,6 +105,14 @@ class Rest(msgspec.Struct, frozen=True):
     states: dict[str, str]  # digests of the Servers' states, by replica
 
 
+class StruckNode(NamedTuple):
+    """A node that died of a fault, or was stopped: by a fault, for `for_ms` (0: for good), or by a fence."""
+
+    t_ns: int
+    node: str
+    for_ms: int = 0
+
+
 class Run(msgspec.Struct, frozen=True):
     """What a run leaves behind."""
 
@@ -121,7 +129,7 @@ class Run(msgspec.Struct, frozen=True):
     drive_end: End | None  # None: the car was still under way, or there was none
     drive_us: int  # of bus time
     effects: dict[str, int]  # by brick: how many it has performed in its first life
-    struck: tuple[tuple[int, str], ...]  # nodes that died, or were stopped, of a fault, and when
+    struck: tuple[StruckNode, ...]
 
 
 @lru_cache(maxsize=8)
@@ -297,7 +305,7 @@ class World:
         self.logged: list[tuple[int, str, str]] = []
         self._ends: dict[int, SimChannel] = {}
         self.failures: list[str] = []
-        self.struck: list[tuple[int, str]] = []  # nodes that died, or were stopped, of a fault, and when
+        self.struck: list[StruckNode] = []
         self.effects: dict[str, int] = {}
         self.lost = False
         self.journal = ExecutiveJournal(self.journals.setdefault("supervisor.1", []))
@@ -310,7 +318,9 @@ class World:
         self.pool.on_report = self._on_report
         self.pool.on_death = self._on_death
         self.pool.on_end = self._on_end
-        self.pool.on_freeze = lambda process: self.struck.append((self.loop.ns, process.name))
+        self.pool.on_freeze = lambda process, ms: self.struck.append(
+            StruckNode(self.loop.ns, process.name, ms)
+        )
         self._launched = False
 
     # -- the runtime, as the executive sees it: see `runtime.interface.Runtime` ------------------
@@ -404,7 +414,7 @@ class World:
             self._count(process.node)
         flipped = STOPPED in reason and any(fault.action.alters_value for fault in self.setup.faults)
         if (not reason or flipped) and process.kind is not ProcessKind.KILLED:
-            self.struck.append((self.loop.ns, process.name))
+            self.struck.append(StruckNode(self.loop.ns, process.name))
         if FUNCTION_FAILED in reason:
             self.log(FUNCTION, reason)
         if reason.startswith("assertion"):
