@@ -6,6 +6,7 @@ from typing import Final
 
 import msgspec
 
+from aftbed.adapt.engine import DONE
 from aftbed.core.application import Application, close
 from aftbed.core.errors import FUNCTION_FAILED
 from aftbed.core.events import Event
@@ -98,14 +99,33 @@ def service_struck_down(run: Run) -> bool:
     if SINGLE in (*(one.node for one in run.struck if not _is_short(one)), *stopped):
         return True
     simplex = any(a.goal.expression and not replication_of(a.goal.expression) for a in run.setup.adaptations)
-    if len(replicas) < 2 or simplex:  # for a time there may have been one replica only
-        return bool(stopped) or not all(_is_short(one) for _, one in strikes)
+    if stopped and (len(replicas) < 2 or simplex):
+        return True
+    if any(_alone(run, one.t_ns) and not _is_short(one) for _, one in strikes):
+        return True
     return any(
         other != replica
         and not (_is_short(first) and _is_short(second))
         and not any(first.t_ns < began and done < second.t_ns for began, done in renewed)
         for (replica, first), (other, second) in itertools.combinations(strikes, 2)
     )
+
+
+def _alone(run: Run, t_ns: int) -> bool:
+    """Whether one replica alone served at `t_ns`, or an adaptation to that was under way."""
+    if len(run.adaptations) < len(run.setup.adaptations):
+        return True  # when the last one began is not known
+    alone = not replication_of(run.setup.ftm)
+    for one in run.adaptations:
+        asked_ns = START_NS + round(one.asked_ms * 1e6)
+        if t_ns < asked_ns:
+            break
+        ended_ns = asked_ns + round(one.total_ms * 1e6)
+        tries_alone = bool(one.tried_ftm) and not replication_of(one.tried_ftm)
+        under_way = tries_alone and t_ns <= ended_ns
+        serves = t_ns >= (one.opened_ns or ended_ns) and one.outcome == DONE
+        alone = under_way or (not replication_of(one.ftm) if serves else alone)
+    return alone
 
 
 def _is_short(one: StruckNode) -> bool:
