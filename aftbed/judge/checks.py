@@ -475,8 +475,7 @@ def check_whole_graph(evidence: Evidence) -> Check:
     if record.lost or evidence.excuses.service_lost:
         return Check("pass")  # no service is left: the other checks judge that
     if record.end.unfinished and not record.simulated:
-        under_way = list(record.end.unfinished)
-        return Check("unknown", (f"the run ended while this was under way: {under_way}",))
+        return Check("unknown", (f"the run ended before it was at rest: {'; '.join(record.end.unfinished)}",))
     return _check(half_a_graph(record.end.hosted, record.ftm))
 
 

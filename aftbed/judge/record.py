@@ -58,7 +58,7 @@ class ClientEnd(msgspec.Struct, frozen=True):
 class RunEnd(msgspec.Struct, frozen=True):
     """How a run ended, by `end.json`. `hosted` is None where no snapshot of the graph was taken.
 
-    `left`: processes that outlived it. `unfinished`: scripts that were under way. `lost`: no replica lived.
+    `left`: processes that outlived it. `unfinished`: why it was not at rest. `lost`: no replica lived.
     `starved_ms`: how long the node that waited longest was ready to run and had no CPU.
     """
 

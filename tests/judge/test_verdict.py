@@ -127,10 +127,10 @@ def test_the_graph_of_a_service_that_is_gone_is_not_asked_for(path: Path) -> Non
 def test_what_was_under_way_at_the_end_is_not_known(path: Path) -> None:
     record = whole(path)
     assert record.end is not None
-    record.end["unfinished"] = ["new backup"]
+    record.end["unfinished"] = ["new backup is under way"]
     verdict = record.verdict()
     assert (verdict.verdict, verdict.checks["whole_graph"]) == ("inconclusive", "unknown")
-    assert verdict.reasons == ["whole_graph: the run ended while this was under way: ['new backup']"]
+    assert verdict.reasons == ["whole_graph: the run ended before it was at rest: new backup is under way"]
 
 
 def test_a_fail_weighs_more_than_what_is_not_known(path: Path) -> None:

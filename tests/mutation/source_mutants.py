@@ -250,6 +250,15 @@ MUTANTS: Final = (
         ("tests/sim/test_promises.py",),
     ),
     SourceMutant(
+        "a run that ends without redundancy passes",
+        "G8",
+        f"{UNIX}/supervisor.py",
+        "self._unfinished = self._controller.unrest()",
+        "self._unfinished = self._controller.under_way()",
+        PROCESS,
+        ("tests/process/test_at_rest.py::test_a_run_that_ends_without_redundancy_is_no_pass",),
+    ),
+    SourceMutant(
         "a Watchdog that dies while it is put in place stays away",
         "G5",
         f"{RUNTIME}/run_controller.py",

@@ -7,7 +7,9 @@ from liveruns import Home, Started, until
 
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
+from aftbed.core.script import ScriptKind
 from aftbed.inject.model import parse
+from aftbed.runtime.script_executor import ScriptExecutor
 from aftbed.runtime.unix.options import LoadRun
 from aftbed.runtime.unix.process_pool import UnixProcess
 
@@ -57,3 +59,15 @@ def test_the_end_of_a_run_is_nothing_to_recover_from(
     outcome = Started(home, LoadRun(COUNT, 0.0), ftm=ftm).finish()
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
     assert not outcome.record.history.events(Event.WATCHDOG_SUSPECT, Event.RECOVERY_ENTER)
+
+
+def test_a_run_that_ends_without_redundancy_is_no_pass(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Recovery orders a new backup, and the supervisor, a fork of this process, does not make it."""
+    monkeypatch.setattr(ScriptExecutor, "stale", lambda _, script: script.kind is ScriptKind.NEW_BACKUP)
+    fault = parse("crash backup at checkpoint.applied nth 5")
+    outcome = Started(home, LoadRun(COUNT, 0.0), faults=(fault,)).finish()
+    assert outcome.verdict.verdict == "inconclusive"
+    missing = "; ".join(
+        f"b/{part} is missing" for part in ("after", "before", "proceed", "protocol", "server")
+    )
+    assert outcome.verdict.reasons == [f"whole_graph: the run ended before it was at rest: {missing}"]

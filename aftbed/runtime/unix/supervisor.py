@@ -326,7 +326,7 @@ class Supervisor:
             return
         if command_gone or settled or self._drains_too_long(began_ns, waited_ns):
             if not settled and not command_gone:
-                self._unfinished = self._controller.under_way()
+                self._unfinished = self._controller.unrest()
             self._controller.ending = True
             self._loop.end()
             return
