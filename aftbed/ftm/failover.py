@@ -6,12 +6,13 @@ of a failover is replaced by one that knows as much.
 
 | leader             | backup            | script                        |
 |--------------------|-------------------|-------------------------------|
-| suspected          | there             | failover: the backup leads    |
-| any                | suspected         | drop backup: the leader alone |
+| suspected          | sound             | failover: the backup leads    |
+| crashed            | has hung          | failover: the backup leads    |
+| any other          | suspected         | drop backup: the leader alone |
 | sound, or has hung | none, slot vacant | new backup, by state transfer |
 
-A leader that has hung may serve again by now. If it answers the script for a new backup, the failover to that
-backup follows, since the suspicion stands; if it does not, the script fails.
+A replica that has hung may serve again by now. If a leader that has hung answers the script for a new backup,
+the failover to that backup follows, since the suspicion stands; if it does not, the script fails.
 
 By which ports a leader sends to its backup, and whose state a new backup needs, depends on the mechanism:
 the situation has both. Without such a port there is one replica, and nothing to be done about its death.
@@ -147,8 +148,10 @@ def decide(now: Situation, suspects: Suspicions) -> Script | None:
     if not now.leader or not now.replication:
         return None
     of_leader = suspects.get((now.leader, now.leader_generation))
+    of_backup = suspects.get((now.backup, now.backup_generation))
     if now.backup:
-        if (now.backup, now.backup_generation) in suspects:
+        last_hope = of_leader is Loss.CRASH and of_backup is Loss.HANG
+        if of_backup and not last_hope:
             return drop_backup(now.leader, now.backup, now.replication)
         return failover(now.leader, now.backup, now.epoch + 1) if of_leader else None
     if now.vacant and of_leader is not Loss.CRASH:

@@ -70,6 +70,9 @@ def alarm(replica: str, generation: int = 1) -> Suspect:
         (WHOLE, {("a", 1): Loss.HANG}, failover("a", "b", 2)),
         (WHOLE, {("b", 1): Loss.CRASH}, dropped()),
         (WHOLE, {("a", 1): Loss.HANG, ("b", 1): Loss.HANG}, dropped()),
+        (WHOLE, {("a", 1): Loss.HANG, ("b", 1): Loss.CRASH}, dropped()),
+        (WHOLE, {("a", 1): Loss.CRASH, ("b", 1): Loss.CRASH}, dropped()),
+        (WHOLE, {("a", 1): Loss.CRASH, ("b", 1): Loss.HANG}, failover("a", "b", 2)),  # it may go on
         (WHOLE, {("a", 2): Loss.CRASH}, None),  # another generation's
         (ALONE, {}, renewed("a", "b")),
         (ALONE, {("a", 1): Loss.CRASH}, None),  # no replica is left to take over
