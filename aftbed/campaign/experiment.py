@@ -213,6 +213,12 @@ ALONE: Final = (
     "unavailable",
 )  # or, if it had a good replica taken for hung, with a fault behind it
 ON_ACTIVATION: Final = {"faults_applied", "adaptations_done", FTTI}  # the result says these in other ways
+# A service that is gone has not sent all of its load, nor made a backup; and that is one way to be degraded.
+SAID_BY_OUTCOME: Final = {
+    "unavailable": {"complete", "whole_graph"},
+    "hang": {"complete", "whole_graph"},
+    "degraded": {"whole_graph"},
+}
 UNEXCUSED: Final = (
     "one_master",
     "whole_graph",
@@ -317,14 +323,7 @@ def _real(experiment: Experiment, standing: ExitStack, records: Path | None) -> 
     noisy = _probe().noisy()
     evidence = evidence_of(_recorded(experiment, standing), trust=OWN_RUN)
     verdict, (outcome, reasons) = judge(evidence.record, evidence), outcome_of(evidence)
-    # G8: what the harness does not know is worse than any outcome that it believes to have seen.
-    unknown = {name for name, word in verdict.checks.items() if word == "unknown"} - ON_ACTIVATION
-    if outcome in ("unavailable", "hang"):
-        unknown -= {"complete"}  # which is why not all of the load was sent
-    if "clean_exit" in unknown:
-        outcome, reasons = "harness_error", tuple(verdict.reasons)
-    elif unknown and outcome != "sdc":
-        outcome, reasons = "inconclusive", tuple(verdict.reasons)
+    outcome, reasons = known_outcome(outcome, reasons, verdict)
     result = _result(experiment, evidence, verdict, outcome, reasons)
     end = evidence.record.end or RunEnd()
     alarmed = end.starved_ms > STALL_MS and false_alarm(evidence)
@@ -337,6 +336,17 @@ def _real(experiment: Experiment, standing: ExitStack, records: Path | None) -> 
             if not records.is_dir() or sum(1 for _ in records.iterdir()) < RECORDS_MAX:
                 copy_sealed(evidence.record.path, records / experiment.id)
     return result
+
+
+def known_outcome(outcome: str, reasons: tuple[str, ...], verdict: Verdict) -> tuple[str, tuple[str, ...]]:
+    """G8: what the harness does not know is worse than any outcome that it believes to have seen."""
+    unknown = {name for name, word in verdict.checks.items() if word == "unknown"}
+    unknown -= ON_ACTIVATION | SAID_BY_OUTCOME.get(outcome, set())
+    if "clean_exit" in unknown:
+        return "harness_error", tuple(verdict.reasons)
+    if unknown and outcome != "sdc":
+        return "inconclusive", tuple(verdict.reasons)
+    return outcome, reasons
 
 
 def _excused(result: Result, starved_ms: float) -> bool:

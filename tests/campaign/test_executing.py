@@ -1,12 +1,21 @@
 """An experiment is an outcome, whatever happens in it; what happens to its record is raised."""
 
 import errno
+from pathlib import Path
 
 import msgspec
 import pytest
+from records import whole
 
 from aftbed.campaign import experiment
-from aftbed.campaign.experiment import Experiment, Result, carry_out, forbidden_by, golden_drive
+from aftbed.campaign.experiment import (
+    Experiment,
+    Result,
+    carry_out,
+    forbidden_by,
+    golden_drive,
+    known_outcome,
+)
 from aftbed.campaign.plan import plan
 from aftbed.campaign.spec import read_spec
 from aftbed.judge.outcome import OUTCOMES
@@ -37,6 +46,36 @@ def test_an_error_of_any_kind_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> 
     assert (result.outcome, result.activated) == ("harness_error", False)
     assert result.reasons[0].startswith("ZeroDivisionError: ")
     assert kept == [result]
+
+
+@pytest.mark.parametrize(
+    ("outcome", "known"),
+    [
+        ("masked", "inconclusive"),
+        ("tolerated", "inconclusive"),
+        ("degraded", "degraded"),
+        ("omission", "inconclusive"),
+        ("unavailable", "unavailable"),
+        ("hang", "hang"),
+        ("sdc", "sdc"),
+    ],
+)
+def test_a_run_that_ends_without_redundancy_is_known_where_its_outcome_says_it(
+    tmp_path: Path, outcome: str, known: str
+) -> None:
+    record = whole(tmp_path)
+    assert record.end is not None
+    record.end["unfinished"] = ["b/after is missing"]
+    found, reasons = known_outcome(outcome, ("seen",), record.verdict())
+    assert found == known
+    assert reasons == (("seen",) if found == outcome else tuple(record.verdict().reasons))
+
+
+def test_a_run_that_left_processes_behind_is_trouble_of_the_harness(tmp_path: Path) -> None:
+    record = whole(tmp_path)
+    assert record.end is not None
+    record.end["reason"] = "killed"
+    assert known_outcome("masked", (), record.verdict())[0] == "harness_error"
 
 
 @pytest.mark.simulation
