@@ -99,7 +99,7 @@ def test_how_late_is_late(late_ns: int, alarms: int) -> None:
     assert len(sends(effects)) == alarms
 
 
-def test_a_watchdog_that_is_preempted_between_the_look_and_its_step_suspects_nobody() -> None:
+def test_a_watchdog_that_is_preempted_between_the_look_and_its_step_suspects_no_node() -> None:
     watched = Watched()
     watched.on_time(2 * HANG_DEADLINE_NS)
     looked_ns = watched.now_ns
