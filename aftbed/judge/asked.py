@@ -47,15 +47,12 @@ class AskedAdaptation(msgspec.Struct, frozen=True):
 
 def adaptations(record: RunRecord) -> list[AskedAdaptation]:
     """Those asked for with the run, in their order, then those asked for while it ran."""
-    return _asked_with_run(record) + [_told(one) for one in record.adaptations if not one.scheduled]
-
-
-def _asked_with_run(record: RunRecord) -> list[AskedAdaptation]:
     by_place = {one.scheduled: one for one in record.adaptations}
-    return [
+    with_run = [
         _told(by_place[place]) if place in by_place else _without_end(record, one)
         for place, one in enumerate(record.options.adaptations, 1)
     ]
+    return with_run + [_told(one) for one in record.adaptations if not one.scheduled]
 
 
 def _told(one: Outcome) -> AskedAdaptation:
@@ -93,10 +90,7 @@ def _faults(record: RunRecord) -> list[str]:
 
 
 def _adaptations(record: RunRecord) -> list[str] | None:
-    """Asked for while the run lived, and next once more in the same words: the last try counts."""
-    tries = itertools.groupby(record.adaptations, lambda one: (one.scheduled, one.asked))
-    last = [list(group)[-1] for (scheduled, _), group in tries if not scheduled]
-    asked = _asked_with_run(record) + [_told(one) for one in last]
+    asked = adaptations(record)
     return [str(one) for one in asked if one.outcome != DONE and not one.may_fail] if asked else None
 
 

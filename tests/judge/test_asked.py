@@ -445,31 +445,6 @@ def test_one_whose_time_never_came_proves_nothing(path: Path, asked: Scheduled, 
     assert verdict.reasons == [f"adaptations_done: {asked}: not begun: {reason}"]
 
 
-LIVE: Final = {"outcome": "rolled back", "reason": "no answer within 0.25 s", "asked": "to lfr+tr"}
-AT_LAST: Final = LIVE | {"outcome": "done", "reason": ""}
-
-
-@pytest.mark.parametrize(
-    ("tries", "missing"),
-    [
-        ((LIVE, AT_LAST), 0),
-        ((LIVE, LIVE, AT_LAST), 0),
-        ((LIVE, LIVE), 1),
-        ((AT_LAST, LIVE), 1),
-        ((LIVE, AT_LAST | {"asked": "to pbr"}, AT_LAST), 1),
-        ((LIVE | {"scheduled": 1}, AT_LAST), 1),
-    ],
-)
-def test_one_that_was_asked_for_again_while_it_ran_counts_by_its_last_try(
-    path: Path, tries: tuple[dict[str, object], ...], missing: int
-) -> None:
-    asked = (Scheduled(Goal(expression="lfr+tr"), after_ms=1),) if "scheduled" in tries[0] else ()
-    verdict = adapted(path, asked, *tries).verdict()
-    assert verdict.adaptations is not None and len(verdict.adaptations) == len(tries), "each is told"
-    reasons = [one for one in verdict.reasons if one.startswith("adaptations_done")]
-    assert reasons == ["adaptations_done: to lfr+tr: rolled back: no answer within 0.25 s"] * missing
-
-
 def test_one_that_was_asked_for_while_it_ran_is_told_behind_them(path: Path) -> None:
     live = {"outcome": "rolled back", "reason": "b died", "asked": "to lfr+tr"}
     verdict = adapted(path, (AT_2,), live, DONE | {"ftm": "pbr"}).verdict()
