@@ -14,7 +14,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Generator, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -80,17 +80,18 @@ def _results(plan: CampaignPlan, asked: CampaignRunOptions, path: Path) -> Gener
     edges = [round(stop.experiments * look / looks) for look in range(looks + 1)]
     for first, last in itertools.pairwise(edges):  # parts of the numbers of each stratum, a look after each
         todo = (e for e in state.open(first, last) if asked.has(e.index, len(plan.strata)))
-        for result in performed(todo, path, asked, plan):
-            state.add(result)
-            yield result
-            late = limit_s is not None and time.monotonic() > limit_s
-            if late or (stop.first_failure and result.unexpected):
-                return
+        with closing(performed(todo, path, asked, plan)) as results:
+            for result in results:
+                state.add(result)
+                yield result
+                late = limit_s is not None and time.monotonic() > limit_s
+                if late or (stop.first_failure and result.unexpected):
+                    return
 
 
 def performed(
     todo: Iterator[Experiment], path: Path, asked: CampaignRunOptions, plan: CampaignPlan
-) -> Iterator[Result]:
+) -> Generator[Result, None, None]:
     """Each result, which is in the ledger by then."""
     if not asked.scheduler:
         perform = partial(_perform, os.fspath(path))
@@ -102,7 +103,7 @@ def performed(
         if apart and not fresh:
             seconds_max = own_seconds_max(system.requests)
         really = _Really(path, plan, seconds_max) if apart and not fresh else None
-        results = each(
+        found = each(
             perform,
             todo,
             asked.jobs,
@@ -112,15 +113,16 @@ def performed(
             apart=apart,
             instead=really,
         )
-        for _, _, result in results:
-            yield result
+        with closing(found):
+            for _, _, result in found:
+                yield result
         return
     from aftbed.campaign import dask  # noqa: PLC0415 - an extra
 
     descriptor = ledger.opened(path)
     try:
-        with dask.connect(asked.scheduler) as client:
-            for result in dask.over(client, todo):
+        with dask.connect(asked.scheduler) as client, closing(dask.over(client, todo)) as results:
+            for result in results:
                 ledger.append(descriptor, result)
                 yield result
     finally:

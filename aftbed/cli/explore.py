@@ -264,8 +264,11 @@ def order(given: ExploreOrderArguments) -> int:
     setups = list(experiments(chosen.ftms, chosen.placements, given.count))
     stopped = False
     try:
-        with ProgressLine("explore order", len(setups), "experiments", plain=not given.json) as progress:
-            for one in explore_orders(setups, given.bound, jobs):
+        with (
+            ProgressLine("explore order", len(setups), "experiments", plain=not given.json) as progress,
+            closing(explore_orders(setups, given.bound, jobs)) as results,
+        ):
+            for one in results:
                 found.append(one)
                 if not given.json:
                     progress.print(_order_text(one))

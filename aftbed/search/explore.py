@@ -12,6 +12,7 @@ that a broken one is repeated by its number in the same `Selection`.
 
 import itertools
 from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing
 from functools import lru_cache, partial
 from random import Random
 from typing import Final, NamedTuple
@@ -325,9 +326,9 @@ def explore(
     if apart:
         setups = list(setups)
         seconds_max = own_seconds_max(max((setup.count for setup in setups), default=0))
-    found = each(judged, setups, jobs, alone=alone, seconds_max=seconds_max, apart=apart)
-    for number, setup, (lost, broken) in found:
-        yield number, setup, lost, broken
+    with closing(each(judged, setups, jobs, alone=alone, seconds_max=seconds_max, apart=apart)) as found:
+        for number, setup, (lost, broken) in found:
+            yield number, setup, lost, broken
 
 
 # -- `explore order`: every order in which messages can arrive ------------------------------------
@@ -380,9 +381,12 @@ def all_orders(setup: Setup, runs_max: int = RUNS_MAX) -> OrderedRuns:
     return OrderedRuns(setup, whole, cut, not left, tuple(map(str, first)), broken)
 
 
-def explore_orders(setups: Iterable[Setup], runs_max: int = RUNS_MAX, jobs: int = 1) -> Iterator[OrderedRuns]:
+def explore_orders(
+    setups: Iterable[Setup], runs_max: int = RUNS_MAX, jobs: int = 1
+) -> Generator[OrderedRuns, None, None]:
     """Every experiment, in order."""
     seconds_max = max(SECONDS_MAX, runs_max * RUN_SECONDS_MAX)
     judge = partial(all_orders, runs_max=runs_max)
-    for _, _, found in each(judge, setups, jobs, seconds_max=seconds_max):
-        yield found
+    with closing(each(judge, setups, jobs, seconds_max=seconds_max)) as found:
+        for _, _, one in found:
+            yield one

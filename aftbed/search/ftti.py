@@ -36,6 +36,7 @@ Limits: a search and no proof. To break a row is taken to need one length, beyon
 """
 
 from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import closing
 from enum import StrEnum
 from functools import lru_cache
 from pathlib import Path
@@ -116,8 +117,9 @@ class FttiSearch(msgspec.Struct, frozen=True):
 
 def searched(todo: Sequence[FttiSearch], jobs: int) -> Generator[FttiRow, None, None]:
     """The row of each, in order."""
-    for _, _, row in each(ftti, todo, jobs):
-        yield row
+    with closing(each(ftti, todo, jobs)) as found:
+        for _, _, row in found:
+            yield row
 
 
 def ftti(todo: FttiSearch) -> FttiRow:

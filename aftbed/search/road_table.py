@@ -12,6 +12,7 @@ Rows that begin alike are driven once: the tables ask for different things of th
 """
 
 from collections.abc import Generator, Iterable, Sequence
+from contextlib import closing
 from math import sqrt
 from typing import Final
 
@@ -98,8 +99,9 @@ def drives(cases: Sequence[Case], lines: Iterable[RoadLine], seed: int) -> list[
 
 def driven(todo: Sequence[RoadDrive], jobs: int) -> Generator[tuple[DrivenRow, ...], None, None]:
     """The rows of each drive, in order. Raises HarnessError if the simulator breaks down."""
-    for _, _, rows in each(drive, todo, jobs):
-        yield rows
+    with closing(each(drive, todo, jobs)) as found:
+        for _, _, rows in found:
+            yield rows
 
 
 def drive(todo: RoadDrive) -> tuple[DrivenRow, ...]:

@@ -4,13 +4,21 @@ import itertools
 import os
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
+from campaigns import planned
 
+from aftbed.campaign import runner
 from aftbed.core.errors import HarnessError
+from aftbed.runtime.sim.world import Setup
+from aftbed.runtime.unix import worker_pool
 from aftbed.runtime.unix.worker_pool import each
+from aftbed.search.explore import explore, explore_orders
+from aftbed.search.road_table import RoadLine, driven, drives
+from aftbed.vehicle.scenarios.tables import cases
 
 pytestmark = pytest.mark.process
 
@@ -143,3 +151,38 @@ def test_results_before_an_error_are_handed_on_and_the_error_says_where_it_was_r
 def test_an_error_of_an_experiment_is_no_hang() -> None:
     with pytest.raises(TimeoutError, match="of its own: 0"):
         list(each(late, range(3), 2))
+
+
+def campaign(folder: Path) -> Generator[object, None, None]:
+    return runner.run(planned(folder), runner.CampaignRunOptions(folder / "out", jobs=2))
+
+
+def explored(folder: Path) -> Generator[object, None, None]:
+    return explore([Setup("lfr", seed=seed, count=1) for seed in range(9)], 2)
+
+
+def ordered(folder: Path) -> Generator[object, None, None]:
+    return explore_orders([Setup("none", seed=seed, count=1) for seed in range(9)], 9, 2)
+
+
+def driven_rows(folder: Path) -> Generator[object, None, None]:
+    return driven(drives(cases("r152", "m1")[:3], [RoadLine("bare", "none")], 0), 2)
+
+
+@pytest.mark.parametrize("command", [campaign, explored, ordered, driven_rows])
+def test_an_interrupt_while_workers_end_reaches_the_command(
+    command: Callable[[Path], Generator[object, None, None]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The garbage collector, had it to end them, would write it to stderr as ignored, and go on."""
+    before, ready, interrupts = workers(), worker_pool._ready, ["one"]
+
+    def interrupted(fds: Iterable[int], seconds: float) -> set[int]:
+        if interrupts:
+            raise KeyboardInterrupt(interrupts.pop())
+        return ready(fds, seconds)
+
+    with pytest.raises(KeyboardInterrupt), closing(command(tmp_path)) as results:
+        next(results)
+        monkeypatch.setattr(worker_pool, "_ready", interrupted)
+    assert not interrupts
+    assert workers() <= before

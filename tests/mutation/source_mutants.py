@@ -1039,6 +1039,15 @@ MUTANTS: Final = (
             "tests/runtime/test_rehearsal.py::test_what_waits_for_a_failover_rehearses_and_a_new_backup_when_it_is_ready",
         ),
     ),
+    SourceMutant(
+        "the workers of a campaign that is interrupted are ended by the garbage collector",
+        "G7",
+        "aftbed/campaign/runner.py",
+        "with closing(performed(todo, path, asked, plan)) as results:",
+        "if results := performed(todo, path, asked, plan):",
+        PROCESS,
+        ("tests/campaign/test_each.py::test_an_interrupt_while_workers_end_reaches_the_command",),
+    ),
 )
 
 

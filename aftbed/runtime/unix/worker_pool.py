@@ -22,6 +22,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing
 from select import POLLIN, poll
 from typing import Any, Final, NoReturn, TypeVar, cast
 
@@ -66,6 +67,9 @@ def each(
     raises is raised here. Raises HarnessError if a worker dies, or takes more than `seconds_max`
     for one experiment; `alone` is the command that runs it by itself. With `instead`, what that returns in
     this process is the result of such an experiment.
+
+    Use it in `contextlib.closing`: its workers end when it is closed, and an interrupt of that is lost if the
+    garbage collector closes it.
     """
     if jobs == 1 and not (fresh or apart):
         for number, setup in enumerate(setups):
@@ -119,7 +123,9 @@ def once(
     alone: Alone[S] | None = None,
 ) -> T:
     """What `judge` finds in one experiment. As `each`."""
-    ((_, _, found),) = each(judge, [setup], alone=alone, seconds_max=seconds_max, fresh=fresh, apart=apart)
+    results = each(judge, [setup], alone=alone, seconds_max=seconds_max, fresh=fresh, apart=apart)
+    with closing(results):
+        ((_, _, found),) = results
     return found
 
 
