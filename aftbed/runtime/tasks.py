@@ -14,6 +14,7 @@ from aftbed.core.errors import StepFailed
 
 STEP_SECONDS_MAX: Final = 2.0
 EARLY_MAX: Final = 256
+ANEW_MAX: Final = 3  # times that one wait begins anew
 STATS_TASK: Final = "stats"
 
 Key = tuple[str, str, int]
@@ -56,7 +57,7 @@ class _TaskRun:
         self.name, self.steps, self.on_end = name, steps, on_end
         self.wait = Wait(frozenset())
         self.got: dict[Key, bytes] = {}
-        self.deadline_ns = 0
+        self.deadline_ns = self.anew = 0
 
 
 class Tasks:
@@ -121,6 +122,13 @@ class Tasks:
             missing = ", ".join(who if what == "ack" else f"{who} ({what})" for what, who, _ in keys)
             self._throw([run], f"no answer within {run.wait.seconds:g} s from {missing}")
 
+    def begin_anew(self) -> None:
+        """The machine stood still, so nothing could answer: each wait has all of its time again."""
+        for run in self._tasks:
+            if run.anew < ANEW_MAX:
+                run.anew += 1
+                run.deadline_ns = self._now_ns() + round(run.wait.seconds * 1e9)
+
     def deadline_ns(self) -> int | None:
         """The earliest deadline."""
         return min((run.deadline_ns for run in self._tasks), default=None)
@@ -139,7 +147,7 @@ class Tasks:
                 else:
                     run.wait = run.steps.send(result)  # type: ignore[arg-type]  # None begins a generator
                 run.got = {key: self._early.pop(key) for key in run.wait.keys & self._early.keys()}
-                run.deadline_ns = self._now_ns() + round(run.wait.seconds * 1e9)
+                run.deadline_ns, run.anew = self._now_ns() + round(run.wait.seconds * 1e9), 0
                 refused = [self._refused.pop(key) for key in run.wait.keys & self._refused.keys()]
                 if refused:
                     result = StepFailed(refused[0])

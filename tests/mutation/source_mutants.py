@@ -1048,6 +1048,15 @@ MUTANTS: Final = (
         PROCESS,
         ("tests/campaign/test_each.py::test_an_interrupt_while_workers_end_reaches_the_command",),
     ),
+    SourceMutant(
+        "a machine that stood still fails what is waited for",
+        "G1",
+        f"{UNIX}/event_loop.py",
+        "if now_ns - due_ns > STALL_NS:",
+        "if not now_ns:",
+        PROCESS,
+        ("tests/runtime/test_event_loop.py",),
+    ),
 )
 
 

@@ -7,7 +7,16 @@ from typing import Final
 import pytest
 
 from aftbed.core.errors import StepFailed
-from aftbed.runtime.tasks import EARLY_MAX, STEP_SECONDS_MAX, Key, Task, Tasks, Wait, run_after_first_yield
+from aftbed.runtime.tasks import (
+    ANEW_MAX,
+    EARLY_MAX,
+    STEP_SECONDS_MAX,
+    Key,
+    Task,
+    Tasks,
+    Wait,
+    run_after_first_yield,
+)
 
 ONE: Final[Key] = ("ack", "a/after", 1)
 TWO: Final[Key] = ("ack", "b/after", 2)
@@ -139,6 +148,21 @@ def test_what_is_past_its_deadline_fails_and_says_what_is_missing(tasks: Tasks) 
     assert run.ends == []
     tasks.expire(due_ns)
     assert run.undone == ["no answer within 0.25 s from b/after"] and other.ends == []
+
+
+def test_a_wait_begins_anew_after_the_machine_stood_still_but_not_for_ever(tasks: Tasks) -> None:
+    run = Run(tasks, wait(ONE, seconds=0.25), wait(TWO, seconds=60))
+    for _ in range(ANEW_MAX):
+        first_ns = tasks.deadline_ns()
+        tasks.begin_anew()
+        assert (tasks.deadline_ns() or 0) > (first_ns or 0)
+    last_ns = tasks.deadline_ns()
+    tasks.begin_anew()
+    assert tasks.deadline_ns() == last_ns
+    tasks.settle(ONE)
+    tasks.begin_anew()
+    tasks.expire((last_ns or 0) + 1_000_000_000)
+    assert run.undone == [], "the next wait has a deadline of its own"
 
 
 def test_each_step_has_its_own_deadline(tasks: Tasks) -> None:

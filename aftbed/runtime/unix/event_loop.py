@@ -6,9 +6,12 @@ import itertools
 import select
 import time
 from collections.abc import Callable
+from typing import Final
 
 from aftbed.core.errors import StepFailed
 from aftbed.runtime.tasks import Tasks
+
+STALL_NS: Final = 250_000_000  # woken later than this, a process was not merely waiting for its turn
 
 
 def _call(call: Callable[[], None]) -> None:
@@ -54,8 +57,12 @@ class EventLoop:
 
     def run(self) -> None:
         while not self._ended:
-            polled = self._epoll.poll(self._patience_seconds())
+            patience_s = self._patience_seconds()
+            due_ns = time.monotonic_ns() + round(patience_s * 1e9)
+            polled = self._epoll.poll(patience_s)
             now_ns = time.monotonic_ns()  # before the calls: what arrives while they run is not late yet
+            if now_ns - due_ns > STALL_NS:
+                self.tasks.begin_anew()
             ready = [(fd, self._readers[fd]) for fd, _ in polled if fd in self._readers]
             for turn in (False, True):
                 for fd, reader in ready:
