@@ -15,7 +15,7 @@ import sys
 from collections.abc import Iterator
 from typing import Final, TextIO
 
-from aftbed.cli.interrupted import interrupted
+from aftbed.cli.interrupted import EXIT_INTERRUPTED, interrupted
 from aftbed.core.errors import ConfigError, HarnessError, PeerError, shown
 from aftbed.runtime.unix import interrupts
 
@@ -30,26 +30,36 @@ def main() -> None:
     """The console script `aftbed`."""
     fresh = "typer" not in sys.modules  # this interpreter has been started for this command
     try:
+        try:
+            code = _run(fresh=fresh)
+        except KeyboardInterrupt:  # outside of a command, or once more while it cleaned up
+            code = interrupted()
+        if fresh:
+            interrupts.ignore()  # nothing is left that it could end
+    except KeyboardInterrupt:  # once more
+        code = EXIT_INTERRUPTED
+        interrupts.ignore()
+    for stream in (sys.stdout, sys.stderr):
+        if not _taken(stream):  # the interpreter would try again at its end, and complain
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    sys.exit(code)
+
+
+def _run(*, fresh: bool) -> int:
+    """Run the command; its exit code."""
+    try:
         _prepare()
         if fresh:  # what is imported stays; to look for garbage in it takes a tenth of the time
             interrupts.listen()
             gc.disable()  # until the command has been imported: see `lazy`
         with _head_start(sys.argv[1:]) if fresh else contextlib.nullcontext():
-            code = _call()
+            return _call()
     except ConfigError as error:
-        code = interrupted() if interrupts.came() else _explain(EXIT_USAGE, f"error: {error}")
+        return interrupted() if interrupts.came() else _explain(EXIT_USAGE, f"error: {error}")
     except (HarnessError, PeerError) as error:  # a run that was cut short is no trouble
-        code = interrupted() if interrupts.came() else _explain(EXIT_TROUBLE, f"trouble: {error}")
+        return interrupted() if interrupts.came() else _explain(EXIT_TROUBLE, f"trouble: {error}")
     except OSError as error:
-        code = interrupted() if interrupts.came() else _failed(error)
-    except KeyboardInterrupt:  # outside of a command, or once more while it cleaned up
-        code = interrupted()
-    if fresh and interrupts.came():
-        interrupts.ignore()  # nothing is left that it could end
-    for stream in (sys.stdout, sys.stderr):
-        if not _taken(stream):  # the interpreter would try again at its end, and complain
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-    sys.exit(code)
+        return interrupted() if interrupts.came() else _failed(error)
 
 
 def _prepare() -> None:
@@ -99,7 +109,8 @@ def _call() -> int:
             word.encode()
         except UnicodeEncodeError:  # neither messages nor JSON could carry it
             raise ConfigError(f"{word!a}: not UTF-8; choose another name, or set LANG=C.UTF-8") from None
-    from aftbed.cli.app import app  # noqa: PLC0415 - typer, behind the head start of a run
+    with interrupts.uninterrupted():
+        from aftbed.cli.app import app  # noqa: PLC0415 - typer, behind the head start of a run
 
     code: object = 0
     streams = sys.stdout, sys.stderr

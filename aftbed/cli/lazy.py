@@ -10,6 +10,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from aftbed.cli import examples
 from aftbed.cli.parsing import PlainCommand, PlainGroup
+from aftbed.runtime.unix.interrupts import uninterrupted
 
 CommandTable = Mapping[
     str, tuple[str, str]
@@ -31,7 +32,8 @@ class LazyCommand(TyperCommand):
     def load(self) -> TyperCommand | TyperGroup:
         """The command, with its options or its subcommands."""
         module, _, attribute = self._place.partition(":")
-        found = getattr(importlib.import_module(f"aftbed.cli.{module}"), attribute)
+        with uninterrupted():
+            found = getattr(importlib.import_module(f"aftbed.cli.{module}"), attribute)
         if not gc.isenabled():  # see `main`
             gc.freeze()
             gc.enable()

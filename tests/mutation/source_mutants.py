@@ -1057,6 +1057,15 @@ MUTANTS: Final = (
         PROCESS,
         ("tests/runtime/test_event_loop.py",),
     ),
+    SourceMutant(
+        "Ctrl-C while a command is imported is another error",
+        "G7",
+        "aftbed/cli/lazy.py",
+        "with uninterrupted():",
+        "if uninterrupted:",
+        PROCESS,
+        ("tests/process/test_interrupts.py::test_an_interrupt_while_modules_are_imported_ends_the_command",),
+    ),
 )
 
 

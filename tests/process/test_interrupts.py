@@ -168,3 +168,41 @@ def test_what_an_interrupted_campaign_says_goes_on(home: Home, tmp_path: Path) -
     )
     assert done.returncode in (0, 1), done.stderr
     assert "records and reports: kept" in done.stdout
+
+
+# A command that is interrupted where it imports a module, or where a class of it names a property.
+IMPORTING: Final = """
+import functools, os, signal, sys
+from aftbed.cli import main
+
+def interrupt(moment):
+    if moment in moments:
+        moments.remove(moment)
+        os.kill(os.getpid(), signal.SIGINT)
+
+def named(self, owner, name, real=functools.cached_property.__set_name__):
+    interrupt(name)
+    real(self, owner, name)
+
+moments, sys.argv = sys.argv[1].split(), ["aftbed", *sys.argv[2:]]
+functools.cached_property.__set_name__ = named
+sys.addaudithook(lambda event, given: interrupt(given[0]) if event == "import" else None)
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "moments"),
+    [
+        (("explore", "crash"), "_ends_latent"),
+        (("run", "--count", "9"), "typer aftbed.report.progress"),
+    ],
+    ids=["the interpreter makes another error of it", "again while the end is said"],
+)
+def test_an_interrupt_while_modules_are_imported_ends_the_command(
+    home: Home, words: tuple[str, ...], moments: str
+) -> None:
+    command = [sys.executable, "-c", IMPORTING, moments, *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=WAIT_SECONDS_MAX)
+    assert (done.returncode, done.stderr) == (EXIT_INTERRUPTED, "aftbed: interrupted\n")
+    until(lambda: not home.left(), f"the end of {home.left()}")

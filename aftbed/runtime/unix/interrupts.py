@@ -1,7 +1,8 @@
 """Ctrl-C: what must not be cut short by it, and whether it came.
 
 An interrupt is a KeyboardInterrupt wherever the command is. A second one may come while the command cleans up
-behind the first: what removes files or starts processes is done in `uninterrupted`.
+behind the first: what removes files or starts processes is done in `uninterrupted`. So are the large imports:
+the interpreter turns what is raised in some places of an import into another error, or drops it.
 """
 
 import contextlib
