@@ -15,7 +15,7 @@ import sys
 from collections.abc import Iterator
 from typing import Final, TextIO
 
-from aftbed.cli.interrupted import EXIT_INTERRUPTED, interrupted
+from aftbed.cli.interrupted import interrupted
 from aftbed.core.errors import ConfigError, HarnessError, PeerError, shown
 from aftbed.runtime.unix import interrupts
 
@@ -37,8 +37,8 @@ def main() -> None:
         if fresh:
             interrupts.ignore()  # nothing is left that it could end
     except KeyboardInterrupt:  # once more
-        code = EXIT_INTERRUPTED
         interrupts.ignore()
+        code = interrupted()
     for stream in (sys.stdout, sys.stderr):
         if not _taken(stream):  # the interpreter would try again at its end, and complain
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
