@@ -18,7 +18,6 @@ follower's Protocol leads, the reply to every request that its leader may have a
 Limit: while a follower is being replaced (by state transfer), the leader serves alone.
 """
 
-from _blake2 import blake2b  # that of hashlib, which loads OpenSSL beside it into each node
 from enum import auto
 from typing import ClassVar, Final
 
@@ -48,6 +47,11 @@ from aftbed.core.messages import (
 )
 from aftbed.ftm.chain import COMPUTE, lead, learn_duplex, promote, promote_at_once
 from aftbed.ftm.declaration import BrickKind, Emits, Mechanism, Suitability
+
+try:
+    from _blake2 import blake2b  # that of hashlib, which loads OpenSSL beside it into each node
+except ImportError:  # another Python than CPython
+    from hashlib import blake2b
 
 DIGEST_BYTES: Final = 16
 
