@@ -11,6 +11,7 @@ from unittest import mock
 import msgspec
 import pytest
 
+from aftbed.core.errors import HarnessError
 from aftbed.runtime.sim.world import Setup, World
 from aftbed.runtime.unix import control_client, run_directory
 from aftbed.runtime.unix.control_server import ControlServer
@@ -59,3 +60,13 @@ def test_another_user_gets_no_answer(tmp_path: Path, more: int) -> None:
         except (BrokenPipeError, ConnectionResetError):
             answer = b""
     assert bool(answer) is not bool(more)
+
+
+def test_a_run_that_ends_with_a_request_unread_is_said_to_have_ended(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind(str(tmp_path / run_directory.SOCKET_NAME))
+        listener.listen()
+        line = control_client.send(tmp_path, control_client.StatusQuery())
+        listener.accept()[0].close()
+        with pytest.raises(HarnessError, match="the run closed the connection: it has ended"):
+            control_client.receive(line)

@@ -159,6 +159,8 @@ def receive(line: Line[Answer], seconds: float = ANSWER_SECONDS_MAX) -> dict[str
     try:
         line.sock.settimeout(seconds)
         got = line.recv()
+    except ConnectionError:  # it ended with our request unread
+        got = None
     except OSError as error:
         raise HarnessError(f"the run did not answer within {seconds:.0f} s: {error}") from None
     finally:

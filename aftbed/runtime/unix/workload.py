@@ -318,11 +318,15 @@ class Workload:
         self._loop.after(pause, self._watch_load)
 
     def _watch_load(self) -> None:
-        """Finish when all is answered, or when nothing moves any more: a lost reply would never come."""
+        """Finish when all is answered, or when nothing moves any more: a lost reply would never come.
+
+        A failover or an adaptation moves, however slow the machine makes it.
+        """
 
         def asked(failure: str) -> None:
             progress, now_ns = (self._stats.get("sent"), self._stats.get("unanswered")), time.monotonic_ns()
-            if progress != self._progress:
+            under_way = bool(self._loop.tasks.names())  # it has limits of its own
+            if progress != self._progress or under_way:
                 self._progress, self._moved_ns = progress, now_ns
             self._counted()
             if self._stats.get("done"):
