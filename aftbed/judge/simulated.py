@@ -84,7 +84,6 @@ def service_struck_down(run: Run) -> bool:
 
     Of two short hangs both replicas recover.
     """
-    replicas = {b.replica for b in run.rest.graph.bricks if b.replica and b.part == "server"}
     renewed = [
         (s.began_ns, s.ended_ns)
         for s in run.scripts
@@ -95,11 +94,10 @@ def service_struck_down(run: Run) -> bool:
     strikes = [(replica, one) for replica, one in named if replica]
     # Supervision stops what a fault has made late. Where there is another replica, that one has to serve.
     late = supervised(run) and bool(run.setup.faults)
-    stopped = [r.node for r in run.history.events(Event.DETECTED_STOP)] if late else []
-    if SINGLE in (*(one.node for one in run.struck if not _is_short(one)), *stopped):
+    stopped = run.history.events(Event.DETECTED_STOP) if late else []
+    if SINGLE in (*(one.node for one in run.struck if not _is_short(one)), *(one.node for one in stopped)):
         return True
-    simplex = any(a.goal.expression and not replication_of(a.goal.expression) for a in run.setup.adaptations)
-    if stopped and (len(replicas) < 2 or simplex):
+    if any(_alone(run, one.t_ns) for one in stopped):
         return True
     if any(_alone(run, one.t_ns) and not _is_short(one) for _, one in strikes):
         return True

@@ -1066,6 +1066,26 @@ MUTANTS: Final = (
         PROCESS,
         ("tests/process/test_interrupts.py::test_an_interrupt_while_modules_are_imported_ends_the_command",),
     ),
+    SourceMutant(
+        "a load is given up in the midst of a failover",
+        "G2",
+        f"{UNIX}/workload.py",
+        "if progress != self._progress or under_way:",
+        "if progress != self._progress:",
+        UNIT,
+        ("tests/runtime/test_workload.py",),
+    ),
+    SourceMutant(
+        "a stop by supervision excuses any loss",
+        "G8",
+        f"{JUDGE}/simulated.py",
+        "if any(_alone(run, one.t_ns) for one in stopped):",
+        "if stopped:",
+        UNIT,
+        (
+            "tests/sim/test_promises.py::test_a_stop_by_supervision_excuses_a_loss_only_where_no_other_replica_served",
+        ),
+    ),
 )
 
 

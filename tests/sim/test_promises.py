@@ -13,6 +13,7 @@ from planting import flip
 
 from aftbed.core.events import Event
 from aftbed.core.journal import Entry, EntryKind, Record
+from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import ScriptKind
 from aftbed.ftm.compose import build
 from aftbed.inject.model import FaultReport
@@ -24,6 +25,7 @@ from aftbed.judge.simulated import SHORT_HANG_MS, breaches, record_of, service_s
 from aftbed.judge.verdict import evidence_of, judge
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.run_controller import ScriptRun
+from aftbed.runtime.sim.clock import START_NS
 from aftbed.runtime.sim.world import Run, Setup, StruckNode, simulate
 from aftbed.vehicle.aeb.function import default_application
 
@@ -33,6 +35,7 @@ MS: Final = 1_000_000
 RENEWAL_MS: Final = 0.1  # from its beginning to its end
 UNBROKEN: Final = simulate(Setup("pbr", count=6))
 SIMPLEX: Final = simulate(Setup("tr", count=6))
+SUPERVISED: Final = simulate(Setup("pbr+sup", count=6))
 SWITCHED: Final = Outcome(1, "pbr to lfr", "drained", "lfr", "done")
 UNDONE: Final = Outcome(1, "pbr to lfr", "drained", "pbr", "rolled back")
 
@@ -256,6 +259,20 @@ def test_a_single_replica_is_struck_down_by_one_fault() -> None:
     assert not service_struck_down(struck("client", "a/watchdog")(SIMPLEX))
     assert service_struck_down(struck("a/server")(SIMPLEX))
     assert not service_struck_down(struck("a/server", for_ms=SHORT_HANG_MS)(SIMPLEX))
+
+
+@pytest.mark.parametrize(("adapted_after_ms", "down"), [(None, False), (1.0, False), (-1.0, True)])
+def test_a_stop_by_supervision_excuses_a_loss_only_where_no_other_replica_served(
+    adapted_after_ms: float | None, down: bool
+) -> None:
+    """Stopped at the end of the run; adapted to one replica then or so, or never."""
+    run = noted("a.after.1", Event.DETECTED_STOP, 3)(with_a_flip(SUPERVISED))
+    if adapted_after_ms is not None:
+        asked_ms = (run.rest.ended_ns - START_NS) / MS + adapted_after_ms
+        alone = Outcome(1, "pbr+sup to sup", "drained", "sup", "done", asked_ms=asked_ms, tried_ftm="sup")
+        setup = replace(run.setup, adaptations=(Scheduled(Goal(expression="sup")),))
+        run = replace(adapted(alone)(run), setup=setup)
+    assert service_struck_down(run) is down
 
 
 def test_what_lives_must_be_the_graph_of_who_leads() -> None:
