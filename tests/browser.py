@@ -43,6 +43,7 @@ def _command(folder: Path, width: int) -> list[str]:
     assert BROWSER is not None
     flags = ["--headless=new", "--disable-gpu", "--enable-logging=stderr", "--no-first-run"]
     flags += ["--disable-background-networking", "--disable-component-update", "--disable-sync"]
+    flags += ["--disable-dev-shm-usage"]  # there it leaves files behind at times, which are not of a run
     flags += ["--no-sandbox"] if os.geteuid() == 0 else []  # Chromium refuses to run as root with one
     return [BROWSER, *flags, f"--user-data-dir={folder / 'profile'}", f"--window-size={width},2000"]
 
