@@ -37,7 +37,8 @@ def main() -> None:
         if fresh:
             interrupts.ignore()  # nothing is left that it could end
     except KeyboardInterrupt:  # once more
-        interrupts.ignore()
+        if fresh:
+            interrupts.ignore()
         code = interrupted()
     for stream in (sys.stdout, sys.stderr):
         if not _taken(stream):  # the interpreter would try again at its end, and complain

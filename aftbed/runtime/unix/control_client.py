@@ -23,7 +23,7 @@ from aftbed.runtime.unix.transport import Line
 from aftbed.vehicle.aeb.messages import Sight
 from aftbed.vehicle.plant import Telemetry
 
-ANSWER_SECONDS_MAX: Final = 5.0  # virtual machines were seen to stand still for three
+ANSWER_SECONDS_MAX: Final = 2.0
 ADAPT_SECONDS_MAX: Final = 15.0  # to prepare, commit, observe and finish, on a busy machine
 CPU_SAMPLE_SECONDS: Final = 0.2
 
