@@ -304,6 +304,20 @@ MUTANTS: Final = (
         ("tests/runtime/test_liveness.py",),
     ),
     SourceMutant(
+        "a node that waits for the rest of a large packet is taken for one that hangs",
+        "G2",
+        f"{UNIX}/node_io.py",
+        """        self._begin_wait()
+        try:
+            raw = transport.take(inlet.fd)
+""",
+        """        try:
+            raw = transport.take(inlet.fd)
+""",
+        UNIT,
+        ("tests/runtime/test_liveness.py",),
+    ),
+    SourceMutant(
         "a write without a reader is given up silently",
         "G3",
         f"{UNIX}/node_io.py",

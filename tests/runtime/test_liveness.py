@@ -28,7 +28,7 @@ from aftbed.runtime.unix.journal_files import JournalFile
 from aftbed.runtime.unix.linux import set_timeouts, state_of
 from aftbed.runtime.unix.liveness import EXCUSED_NS_MAX, Liveness, Starvation
 from aftbed.runtime.unix.node_io import UnixIO
-from aftbed.runtime.unix.transport import ORDER_SECONDS, Line, decode_order
+from aftbed.runtime.unix.transport import ANNOUNCED, ORDER_SECONDS, Line, decode_order
 
 SECONDS_MAX: Final = 20.0
 LOOKS: Final = 4
@@ -87,6 +87,11 @@ class NodeProcess:
         self._input.send(encode(Request(1, 1, what)))
         assert os.read(self._reached, 1) == b"."
 
+    def announce(self) -> None:
+        """Begin to send a large packet, and wait until the node waits for the rest of it."""
+        self._input.send(ANNOUNCED)  # wakes it
+        self.asleep()
+
     def asleep(self) -> None:
         wait_for(lambda: state_of(self.pid) == "S")
 
@@ -138,6 +143,15 @@ def test_a_node_that_waits_for_mail_is_seen_alive_while_it_sleeps(tmp_path: Path
         before = switches(node.pid)
         assert looks(node) == [True] * LOOKS
         assert switches(node.pid) == before, "it was woken up for that"
+
+
+def test_a_node_that_waits_for_the_rest_of_a_large_packet_is_seen_alive(tmp_path: Path) -> None:
+    """Its writer may have been stopped, or not let run, in the midst of sending it."""
+    with node_process(tmp_path) as node:
+        node.ask(PASS)
+        node.asleep()
+        node.announce()
+        assert looks(node) == [True] * LOOKS
 
 
 def test_a_suspended_node_is_seen_alive(tmp_path: Path) -> None:

@@ -359,13 +359,16 @@ class UnixIO(NodeIO[Inlet, int]):
             self._node.step(inlet.hosted, inlet.port, message, raw)
 
     def _take_announced(self, inlet: Inlet) -> None:
-        """Read the large packet that is next, or what has come in between."""
+        """Read the large packet that is next, or what has come in between. Its writer may take its time."""
+        self._begin_wait()
         try:
             raw = transport.take(inlet.fd)
         except PeerError:
             self._announced = None
             self._refuse()
             return
+        finally:
+            self._end_wait()
         if raw != NUDGE:
             self._announced = None
         self._handle_packet(inlet, raw)
