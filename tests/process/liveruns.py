@@ -199,7 +199,7 @@ class Started:
         while self._next(limit, "the end"):
             pass
         self.launched.wait()
-        record = read_record(self.launched.record)
+        record = read_record(self.launched.record, in_memory=True)  # its files go
         self._closed = True
         self.launched.remove()
         return Outcome(record, judge(record), self.events)
@@ -270,9 +270,17 @@ def state_of(pid: int) -> str:
         return ""
 
 
-def under_load(home: Home, count: int, rate_hz: float = 200.0, *, placement: str = "process") -> Started:
+def under_load(
+    home: Home,
+    count: int,
+    rate_hz: float = 200.0,
+    *,
+    ftm: str = "pbr",
+    placement: str = "process",
+    faults: tuple[Fault, ...] = (),
+) -> Started:
     """A run under synthetic load that has begun to answer."""
-    run = Started(home, LoadRun(count, rate_hz), placement=placement)
+    run = Started(home, LoadRun(count, rate_hz), ftm=ftm, placement=placement, faults=faults)
     try:
         run.wait_for("started")
         run.wait_for_answers(20)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from liveruns import ADAPT_TRIES, ENDLESS, NO_TIME, Home, Outcome, Started, until
+from liveruns import ADAPT_TRIES, ENDLESS, NO_TIME, Home, Outcome, Started, under_load, until
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.journal import EntryKind
@@ -18,7 +18,6 @@ from aftbed.core.messages import Goal
 from aftbed.ftm.compose import EXPRESSIONS, NONE, build
 from aftbed.inject.model import Fault
 from aftbed.runtime.unix import control_client
-from aftbed.runtime.unix.options import LoadRun
 
 pytestmark = pytest.mark.process
 
@@ -59,11 +58,8 @@ def adapt(run: Started, goal: Goal) -> dict[str, object]:
 
 
 def serving(home: Home, ftm: str, placement: str, *faults: Fault) -> Started:
-    """A run under load that has begun to answer."""
-    run = Started(home, LoadRun(ENDLESS, RATE_HZ), ftm=ftm, placement=placement, faults=faults)
-    run.wait_for("started")
-    run.wait_for_answers(20)
-    return run
+    """A run under load that has begun to answer, and goes on until it is stopped."""
+    return under_load(home, ENDLESS, RATE_HZ, ftm=ftm, placement=placement, faults=faults)
 
 
 def ended(run: Started) -> Outcome:
