@@ -31,7 +31,7 @@ pytestmark = pytest.mark.process
 COUNT: Final = 100  # requests
 LOAD: Final = ("--load", str(COUNT))  # each follows the reply before it
 HIT: Final = 40  # the request that is hit; TR executes each twice
-DRIVE: Final = ("--scenario", "ccrs-20", "--pace", "max")  # long enough for a new backup, on any machine
+PACED: Final = ("--load", "300@100")  # 3 s: a new backup has time to come, on a busy machine, too
 STAGE: Final = 8  # bit 0 of byte 1 of a reply: of the stage
 COUNTER: Final = 8  # bit 0 of byte 1 of a state: of the counter of the frames
 VERSION: Final = 0  # bit 0 of a state: no function takes a state of another version
@@ -114,7 +114,8 @@ def test_a_state_that_is_wrong_is_the_backups_too(tmp_path: Path) -> None:
 
 def test_a_drive_says_what_the_brakes_were_asked_for() -> None:
     hit = 100  # by then it warns
-    done = aftbed("run", *DRIVE, "--inject", f"bitflip result bit {STAGE} nth {hit}")
+    flip = f"bitflip result bit {STAGE} nth {hit}"
+    done = aftbed("run", "--scenario", "ccrs-20", "--pace", "max", "--inject", flip)
     assert done.code == 1, done.out + done.err
     assert "1 wrong" in done.out and "verdict: fail" in done.out
     assert f"because    value: request {hit}: sdc: stage 0 instead of 1" in done.out
@@ -226,7 +227,7 @@ def test_each_of_several_strikes_at_its_own_execution(tmp_path: Path) -> None:
 @pytest.mark.parametrize("placement", ["process", "replica"])
 def test_a_bitflip_follows_the_leader_over_a_failover(tmp_path: Path, placement: str) -> None:
     flip, crash = f"bitflip result bit {STAGE} nth 200", "crash primary at reply.sent nth 80"
-    ran = served(tmp_path, "pbr", flip, crash, placement=placement, work=DRIVE)
+    ran = served(tmp_path, "pbr", flip, crash, placement=placement, work=PACED)
     assert ran.receipts == ["activated", "activated"] and len(ran.verdict.failovers) == 1
     ((node, request_id),) = ran.hits()
     assert node.startswith("b") and request_id >= 200  # what comes before it has moved is not counted
@@ -234,7 +235,7 @@ def test_a_bitflip_follows_the_leader_over_a_failover(tmp_path: Path, placement:
 
 def test_a_replica_is_hit_whatever_its_role_is_by_then(tmp_path: Path) -> None:
     flip, crash = f"bitflip result bit {STAGE} in a nth 120", "crash primary at reply.sent nth 80"
-    ran = served(tmp_path, "lfr", flip, crash, work=DRIVE)
+    ran = served(tmp_path, "lfr", flip, crash, work=PACED)
     assert ran.receipts == ["activated", "activated"] and len(ran.verdict.failovers) == 1
     ((node, request_id),) = ran.hits()
     assert node == "a/server" and request_id >= 120, "as a follower, in its next life"
