@@ -311,9 +311,12 @@ def aftbed(*arguments: str | Path) -> Done:
 
 
 def adapted(*arguments: str | Path) -> Done:
-    """`aftbed adapt`, once more where a busy machine gave it no time: then all is as it was."""
+    """`aftbed adapt`, once more where a busy machine gave it no time: then all is as it was.
+
+    Each try may fail for the verdict of the run: it is the caller that asserts how the last one ended.
+    """
     for _ in range(ADAPT_TRIES):
-        done = aftbed("adapt", *arguments)
+        done = aftbed("adapt", *arguments, "--may-fail")
         if NO_TIME not in done.out + done.err:
             break
     return done

@@ -3,26 +3,30 @@
 from typing import Final
 
 import pytest
-from liveruns import ENDLESS, Command, Home, adapted, aftbed
+from liveruns import ENDLESS, Command, Home, adapted, aftbed, under_load
 from sampling import every
 
 pytestmark = pytest.mark.process
 
-BALLAST: Final = "update app to aftbed.bench.ballast:Ballast{size}v1 at request 10"
+BALLAST: Final = "aftbed.bench.ballast:{}Ballast{}v{}"
+CRASH: Final = ("inject", "crash", "primary", "--at")
 
 
 @pytest.mark.parametrize(
     ("ftm", "size"),
     every(2, [("pbr", 1_000_000), ("pbr", 100_000), ("lfr+tr", 300_000), ("pbr+tr", 100_000)]),
 )
-def test_a_large_state_is_carried(ftm: str, size: int) -> None:
+def test_a_large_state_is_carried(home: Home, ftm: str, size: int) -> None:
     """Into the new function, to the backup with each request, into a new leader, and to a new backup."""
-    found = aftbed(
-        *("run", "--ftm", ftm, "--load", "200@250", "--adapt", BALLAST.format(size=size)),
-        *("--inject", "crash primary at reply.sent nth 150", "--json"),
-    ).verdict()
+    with under_load(home, ENDLESS, 250.0, ftm=ftm) as run:
+        adapt("update", "app", "--to", BALLAST.format("", size, 1))
+        crash = aftbed(*CRASH, "reply.sent", "--nth", "5")
+        assert crash.code == 0, crash.err
+        run.wait_for("roles", "backs up, epoch 2")
+        run.wait_for_answers(run.answered() + 20)
+        found = run.stop().verdict
     assert found.verdict == "pass", found.reasons
-    assert found.requests.answered == 200 and found.requests.wrong == 0
+    assert found.requests.answered == found.requests.sent and found.requests.wrong == 0
     assert len(found.failovers) == 1
 
 
@@ -31,11 +35,11 @@ def test_megabytes_are_updated_switched_and_taken_over(home: Home, size: int) ->
     """Compared by the Server, then told by a function that knows its changes."""
     with Command("--load", f"{ENDLESS}@50") as run:
         run.started()
-        for epoch, function in ((2, f"Ballast{size}v1"), (3, f"TrackedBallast{size}v2")):
-            adapt("update", "app", "--to", f"aftbed.bench.ballast:{function}")
+        for epoch, function in ((2, ("", size, 1)), (3, ("Tracked", size, 2))):
+            adapt("update", "app", "--to", BALLAST.format(*function))
             adapt("switch", "lfr")
             adapt("switch", "pbr")
-            crash = aftbed("inject", "crash", "primary", "--at", "checkpoint.sent", "--nth", "5")
+            crash = aftbed(*CRASH, "checkpoint.sent", "--nth", "5")
             assert crash.code == 0, crash.err
             run.wait_for_line(f"backs up, epoch {epoch}")
         assert aftbed("stop").code == 0
