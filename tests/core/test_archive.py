@@ -44,6 +44,7 @@ def test_what_is_within_the_limits_is_read(tmp_path: Path) -> None:
         (zipped("a", method=zipfile.ZIP_LZMA), "found 'a' compressed by method 14, allowed are 0 (stored)"),
         (b"", "found no zip archive, as a bundle is, or a broken one"),
     ],
+    ids=["members", "unpacked", "bytes", "path", "method", "empty"],  # an archive has the time in it
 )
 def test_what_is_not_is_refused(tmp_path: Path, data: bytes, why: str) -> None:
     with pytest.raises(ConfigError) as refused:
