@@ -380,10 +380,8 @@ class AnswerWatch:
             if frame is not None and self.take(frame) and mute:
                 end_s = time.monotonic() + NEXT_ANSWER_S_MAX
         if self._outstanding == 0 or self.answered > before:
-            self._outstanding, self._mute = (
-                0,
-                False,
-            )  # older answers of a function that answers again are lost
+            self._outstanding = 0  # older answers of a function that answers again are lost
+            self._mute = False
         elif time.monotonic() >= end_s:  # not stopped before
             self.missing += 1
             self._mute = True
