@@ -59,9 +59,9 @@ PERIOD_S: Final = 0.1  # between two snapshots
 IDLE_S: Final = 0.4  # between two looks whether the run lives, while there is no page
 LOOK_S: Final = 1.0  # between two looks at nodes and processes; for so long behind an event, each period
 SILENT_S: Final = 1.0  # without an answer until the pages are told, and between two times that they are
-LAST_COMMAND_S_MAX: Final = 0.5  # behind the end of the run, until the commands of pages have ended
+LAST_COMMAND_S_MAX: Final = 3.0  # behind the end of the run, until the commands of pages have been answered
 LAST_S_MAX: Final = 0.2  # that the pages may take to read the end
-END_S_MAX: Final = 0.9  # from the end of the run to that of the server
+END_S_MAX: Final = LAST_COMMAND_S_MAX + LAST_S_MAX + 0.2  # from the end of the run to that of the server
 CONNECTIONS_MAX: Final = 16
 COMMANDS_MAX: Final = 2  # at once
 COMMAND_BYTES_MAX: Final = 1000
@@ -402,8 +402,16 @@ class PageRequest(BaseHTTPRequestHandler):
             self._answer(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "text/plain", why)
         else:
             words = self.rfile.read(int(length)).decode(errors="replace")
-            code, text = carry_out(words, self.server.private, self.server.commands)
-            self._answer(HTTPStatus.OK, "application/json", json.dumps({"code": code, "text": text}))
+            if not self.server.commands.acquire(blocking=False):
+                self._answer_command(2, f"{COMMANDS_MAX} commands are under way: wait for one of them")
+                return
+            try:
+                self._answer_command(*carry_out(words, self.server.private))
+            finally:
+                self.server.commands.release()
+
+    def _answer_command(self, code: int, text: str) -> None:
+        self._answer(HTTPStatus.OK, "application/json", json.dumps({"code": code, "text": text}))
 
     def _answer(self, status: HTTPStatus, kind: str, text: str, nonce: str = "") -> None:
         data = text.encode()
@@ -434,7 +442,7 @@ class PageRequest(BaseHTTPRequestHandler):
         """Nothing: the terminal belongs to the run."""
 
 
-def carry_out(words: str, private: Path, at_once: threading.Semaphore) -> tuple[int, str]:
+def carry_out(words: str, private: Path) -> tuple[int, str]:
     """The exit code and the output of `aftbed WORDS` for this run, as at a second terminal."""
     try:
         command = child_command(shlex.split(words), private)
@@ -442,8 +450,6 @@ def carry_out(words: str, private: Path, at_once: threading.Semaphore) -> tuple[
         return 2, f"{words}: quotation marks come in pairs"
     except ConfigError as error:
         return 2, str(error)
-    if not at_once.acquire(blocking=False):
-        return 2, f"{COMMANDS_MAX} commands are under way: wait for one of them"
     try:
         done = subprocess.run(
             command,
@@ -456,8 +462,6 @@ def carry_out(words: str, private: Path, at_once: threading.Semaphore) -> tuple[
         )
     except subprocess.TimeoutExpired:
         return 3, f"no answer within {COMMAND_S_MAX:.0f} s"
-    finally:
-        at_once.release()
     return done.returncode, (done.stdout + done.stderr).strip()[:ANSWER_CHARACTERS_MAX]
 
 

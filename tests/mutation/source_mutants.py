@@ -1100,6 +1100,18 @@ MUTANTS: Final = (
             "tests/sim/test_promises.py::test_a_stop_by_supervision_excuses_a_loss_only_where_no_other_replica_served",
         ),
     ),
+    SourceMutant(
+        "the page ends before the command that has stopped its run is answered",
+        "G8",
+        "aftbed/report/live_page.py",
+        "LAST_COMMAND_S_MAX: Final = 3.0",
+        "LAST_COMMAND_S_MAX: Final = 0.5",
+        PROCESS,
+        (
+            "tests/process/test_live_page.py"
+            "::test_a_command_that_is_under_way_at_the_end_of_the_run_is_answered",
+        ),
+    ),
 )
 
 

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 from urllib.parse import parse_qs, urlsplit
@@ -193,6 +194,33 @@ def test_a_command_is_that_of_a_second_terminal(run: Command) -> None:
     assert run.done().code == 0
 
 
+def supervisor_of(private: Path) -> int:
+    """The pid of the run's supervisor."""
+    return next(row.pid for row in processes(private) if row.name == "supervisor")
+
+
+def server_of(run: Command) -> psutil.Process:
+    """The process that serves the page."""
+    return next(p for p in psutil.Process(run.pid).children() if "aftbed.report.live_page" in p.cmdline())
+
+
+def test_a_command_that_is_under_way_at_the_end_of_the_run_is_answered(run: Command) -> None:
+    shown = address(run)
+    server, supervisor = server_of(run), supervisor_of(run_directory.find(None))
+    with ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(told, shown, "inject crash primary")
+        (command,) = until(server.children, "the command")
+        command.suspend()
+        try:
+            assert aftbed("stop").code == 0
+            assert ended(supervisor) and not ended(server.pid, 1.0)
+        finally:
+            command.resume()
+        code, text = answer.result(SECONDS_MAX)
+    assert (code, "no such run is alive" in text) == (2, True), text
+    assert run.done().code == 0
+
+
 def test_a_browser_that_does_not_read_holds_up_nobody(run: Command) -> None:
     shown = address(run)
     with stream(shown), stream(shown) as other:
@@ -211,7 +239,7 @@ def test_a_browser_that_does_not_read_holds_up_nobody(run: Command) -> None:
 def test_a_run_that_is_stopped_for_a_while_has_not_ended(run: Command) -> None:
     """Its pages are told that it does not answer, and go on when it does."""
     shown = address(run)
-    supervisor = next(row.pid for row in processes(run_directory.find(None)) if row.name == "supervisor")
+    supervisor = supervisor_of(run_directory.find(None))
     with stream(shown) as line:
         seen = snapshots(line)
         assert not next(seen).silent_s
@@ -244,7 +272,7 @@ def test_the_load_of_the_bus_is_that_of_the_drive(home: Home) -> None:
 
 def test_it_ends_with_the_command_whatever_ends_that(run: Command) -> None:
     address(run)
-    server = next(p for p in psutil.Process(run.pid).children() if "aftbed.report.live_page" in p.cmdline())
+    server = server_of(run)
     os.kill(run.pid, signal.SIGKILL)
     assert ended(server.pid, 1.0)
 
