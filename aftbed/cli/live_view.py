@@ -18,7 +18,6 @@ is a process of its own at a low priority (`report.steering`), so neither the ru
 
 import os
 import shlex
-import subprocess
 import textwrap
 import time
 from collections import deque
@@ -34,7 +33,7 @@ from aftbed.cli.colour import Style
 from aftbed.cli.screen import IDLE_S, PERIOD_S, Key, Line, Screen, StyledText
 from aftbed.cli.views import KMH_PER_MS, STAGES, RunView, bus_line, requests_line
 from aftbed.core.errors import shown
-from aftbed.report.steering import ANSWER_CHARACTERS_MAX, COMMAND_S_MAX, child_command
+from aftbed.report.steering import ANSWER_CHARACTERS_MAX, COMMAND_S_MAX, start_command
 from aftbed.runtime.control import ServiceState
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.options import LoadRun, RunOptions
@@ -45,7 +44,6 @@ EVENTS_KEPT: Final = 500
 SAMPLES_KEPT: Final = 1000
 SAMPLE_MS: Final = 100  # of bus time, in a column of the plots
 ROAD_M: Final = 60.0  # at least, from the car to the end of the road
-NICE: Final = 10  # of a command
 LINES_OF_ANSWER_MAX: Final = 4
 # A screen with fewer rows has no place for these.
 ROWS_FOR_COUNTS, ROWS_FOR_PLOTS = 12, 20
@@ -286,14 +284,7 @@ class Command:
 
     def __init__(self, words: Sequence[str], private: Path) -> None:
         self.words = " ".join(words)
-        self._process = subprocess.Popen(
-            child_command(words, private),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,  # a Ctrl-C is for the run
-        )
-        os.setpriority(os.PRIO_PROCESS, self._process.pid, NICE)
+        self._process = start_command(words, private)
         self.descriptor = os.pidfd_open(self._process.pid)
         self._limit_s = time.monotonic() + COMMAND_S_MAX
 
@@ -312,7 +303,7 @@ class Command:
         code = self._process.wait()
         assert self._process.stdout is not None
         with self._process.stdout as printed:  # less than a pipe holds
-            text = printed.read(ANSWER_CHARACTERS_MAX).decode(errors="replace").strip()
+            text = printed.read(ANSWER_CHARACTERS_MAX).strip()
         os.close(self.descriptor)
         return code == 0, text or f"exit code {code}"
 

@@ -3,7 +3,7 @@
 A process of its own serves it, at a low priority: while there is a page, it asks the run for its status as
 `aftbed status` does, and reads the event log and the bus log as they grow. It asks for nodes and processes
 only where an event says that they may have changed, and each `LOOK_S`. The run does not know of it, and a
-browser that does not read holds up nothing but its own connection.
+browser that does not read holds up nothing but its own connection. Commands run at a higher priority.
 
 It keeps one connection to the run, which ends with the run: then, and only then, the run has ended. A run
 that does not answer is stopped, or has no CPU; the pages are told for how long (`Snapshot.silent_s`).
@@ -23,6 +23,7 @@ import hmac
 import json
 import math
 import os
+import queue
 import secrets
 import select
 import shlex
@@ -33,6 +34,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Future
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
@@ -45,7 +47,7 @@ import msgspec
 from aftbed.core.errors import AftbedError, ConfigError
 from aftbed.core.graph import Graph
 from aftbed.ftm.compose import expressions
-from aftbed.report.steering import ANSWER_CHARACTERS_MAX, COMMAND_S_MAX, child_command
+from aftbed.report.steering import ANSWER_CHARACTERS_MAX, COMMAND_S_MAX, start_command
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.unix import control_client, linux, run_directory
 from aftbed.runtime.unix.control_client import ProcessRow
@@ -303,16 +305,40 @@ class RunWatcher:
                 self._pages -= 1
 
 
+class Launcher:
+    """Starts commands, in a thread that keeps the priority which the thread has that makes the Launcher."""
+
+    def __init__(self) -> None:
+        self._wanted: queue.SimpleQueue[tuple[Sequence[str], Path, Future[subprocess.Popen[str]]]] = (
+            queue.SimpleQueue()
+        )
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def start(self, words: Sequence[str], private: Path) -> subprocess.Popen[str]:
+        """As `start_command`."""
+        started: Future[subprocess.Popen[str]] = Future()
+        self._wanted.put((words, private, started))
+        return started.result()
+
+    def _serve(self) -> None:
+        while True:
+            words, private, started = self._wanted.get()
+            try:
+                started.set_result(start_command(words, private))
+            except (ConfigError, OSError) as error:
+                started.set_exception(error)
+
+
 class PageServer(ThreadingHTTPServer):
     """Serves the page of one run on `listener`, which is bound and listens."""
 
     daemon_threads = True
 
-    def __init__(self, listener: socket.socket, private: Path, token: str) -> None:
+    def __init__(self, listener: socket.socket, private: Path, token: str, launcher: Launcher) -> None:
         super().__init__(listener.getsockname(), PageRequest, bind_and_activate=False)
         self.socket.close()
         self.socket = listener
-        self.private, self.token = private, token
+        self.private, self.token, self.launcher = private, token, launcher
         self.port = int(listener.getsockname()[1])
         self.watcher = RunWatcher(private)
         self.commands = threading.Semaphore(COMMANDS_MAX)
@@ -406,7 +432,7 @@ class PageRequest(BaseHTTPRequestHandler):
                 self._answer_command(2, f"{COMMANDS_MAX} commands are under way: wait for one of them")
                 return
             try:
-                self._answer_command(*carry_out(words, self.server.private))
+                self._answer_command(*carry_out(words, self.server.private, self.server.launcher))
             finally:
                 self.server.commands.release()
 
@@ -442,27 +468,21 @@ class PageRequest(BaseHTTPRequestHandler):
         """Nothing: the terminal belongs to the run."""
 
 
-def carry_out(words: str, private: Path) -> tuple[int, str]:
+def carry_out(words: str, private: Path, launcher: Launcher) -> tuple[int, str]:
     """The exit code and the output of `aftbed WORDS` for this run, as at a second terminal."""
     try:
-        command = child_command(shlex.split(words), private)
+        process = launcher.start(shlex.split(words), private)
     except ValueError:
         return 2, f"{words}: quotation marks come in pairs"
     except ConfigError as error:
         return 2, str(error)
-    try:
-        done = subprocess.run(
-            command,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=COMMAND_S_MAX,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return 3, f"no answer within {COMMAND_S_MAX:.0f} s"
-    return done.returncode, (done.stdout + done.stderr).strip()[:ANSWER_CHARACTERS_MAX]
+    with process:
+        try:
+            text, _ = process.communicate(timeout=COMMAND_S_MAX)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            return 3, f"no answer within {COMMAND_S_MAX:.0f} s"
+    return process.returncode, text.strip()[:ANSWER_CHARACTERS_MAX]
 
 
 # -- how it is started --------------------------------------------------------------------------------
@@ -500,8 +520,9 @@ def beside(listener: socket.socket, private: Path, token: str) -> Iterator[None]
 
 def serve(listener: socket.socket, private: Path, token: str, *, starting: bool = False) -> None:
     """Serve the page of the run in `private` until it has ended. `starting`: it may not be there yet."""
+    launcher = Launcher()
     linux.yield_cpu(NICE)
-    PageServer(listener, private, token).serve_until_the_end(starting=starting)
+    PageServer(listener, private, token, launcher).serve_until_the_end(starting=starting)
 
 
 if __name__ == "__main__":

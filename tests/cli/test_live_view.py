@@ -14,11 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from terminal import Terminal
 
-from aftbed.cli import live_view
 from aftbed.cli.colour import Style
 from aftbed.cli.live_view import LiveView, LogLine, Prompt, RunPicture, lines_of
 from aftbed.cli.run import _follow, _open_view
 from aftbed.cli.screen import Key, Screen, StyledText, fitted, keys_in
+from aftbed.report import steering
 from aftbed.runtime import control
 from aftbed.runtime.control import Report, RequestCounts, ServiceState
 from aftbed.runtime.unix.launch import Launched
@@ -298,7 +298,7 @@ def answering(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
     def child_command(words: list[str], private: Path) -> list[str]:
         return ["/bin/sh", "-c", script, private.name, *words]
 
-    monkeypatch.setattr(live_view, "child_command", child_command)
+    monkeypatch.setattr(steering, "child_command", child_command)
 
 
 @pytest.mark.parametrize(

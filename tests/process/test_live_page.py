@@ -210,6 +210,7 @@ def test_a_command_that_is_under_way_at_the_end_of_the_run_is_answered(run: Comm
     with ThreadPoolExecutor(1) as pool:
         answer = pool.submit(told, shown, "inject crash primary")
         (command,) = until(server.children, "the command")
+        assert command.nice() < server.nice()
         command.suspend()
         try:
             assert aftbed("stop").code == 0
