@@ -301,7 +301,7 @@ class Deployment:
         self.pin_watchers()
         for slot in self.slots.values():
             slot.nodes, slot.complete = self.nodes_of(slot), True
-            yield from self.watch(slot)
+            yield from self.watch(slot, seconds=BIRTH_SECONDS_MAX)  # nothing serves yet
 
     def spawn(self, slot: Slot) -> Keys:
         """A new generation of nodes in `slot`, its channels fresh, not leading."""
@@ -343,7 +343,7 @@ class Deployment:
             if source in slot.bricks and "/" in sink and sink not in slot.bricks:
                 channel.fence()
 
-    def watch(self, slot: Slot, *, none: bool = False) -> Keys:
+    def watch(self, slot: Slot, *, none: bool = False, seconds: float = STEP_SECONDS_MAX) -> Keys:
         """Have the Watchdog of `slot` watch its present nodes, or none. Without a Watchdog: nothing.
 
         If one of them is dead already, the replica is `lost`: the next situation informs Recovery.
@@ -368,6 +368,7 @@ class Deployment:
                 tuple(host.pid for host in hosts),
             ),
             tuple(host.pidfd for host in hosts),
+            seconds,
         )
 
     def respawn(self, node: str, *, held: bool = False) -> Keys:

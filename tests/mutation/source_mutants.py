@@ -1112,6 +1112,15 @@ MUTANTS: Final = (
             "::test_a_command_that_is_under_way_at_the_end_of_the_run_is_answered",
         ),
     ),
+    SourceMutant(
+        "a start is given up as fast as a step of a script",
+        "G8",
+        f"{RUNTIME}/deployment.py",
+        "self.watch(slot, seconds=BIRTH_SECONDS_MAX)",
+        "self.watch(slot)",
+        UNIT,
+        ("tests/sim/test_replacements.py::test_a_start_waits_for_a_watchdog_that_gets_no_cpu",),
+    ),
 )
 
 

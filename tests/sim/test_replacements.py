@@ -16,6 +16,7 @@ from aftbed.inject.grammar import Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault
 from aftbed.judge.simulated import breaches
+from aftbed.runtime.deployment import Deployment
 from aftbed.runtime.sim.processes import SimProcess
 from aftbed.runtime.sim.world import Setup, World
 
@@ -25,6 +26,23 @@ STOPPED_MS: Final = 110  # longer than a replacement takes
 SPREAD: Final = 200  # steps over which those that are tried each time are spread; the deep form tries all
 PLACEMENTS: Final = ("process", "replica")
 SINGLES: Final = ("client", "proxy", "recovery", "engine", "a/watchdog", "b/watchdog")
+
+
+def test_a_start_waits_for_a_watchdog_that_gets_no_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For longer than a step of a script may take."""
+    pin_watchers = Deployment.pin_watchers
+
+    def stall(deployment: Deployment) -> None:
+        process = deployment.nodes["a/watchdog"]
+        assert isinstance(process, SimProcess) and process.io is not None
+        process.io.freeze()
+        world.loop.after(5.0, process.io.thaw)
+        pin_watchers(deployment)
+
+    monkeypatch.setattr(Deployment, "pin_watchers", stall)
+    world = World(Setup("pbr"))
+    run = world.run()
+    assert world.loop.ns > 5_000_000_000 and not breaches(run)
 
 
 def struck(placement: str, node: str, neighbour: str) -> tuple[World, SimProcess]:
