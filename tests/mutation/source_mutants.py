@@ -1113,6 +1113,15 @@ MUTANTS: Final = (
         ),
     ),
     SourceMutant(
+        "a spare that ends before its first message is waited for, and no other is forked",
+        "G5",
+        f"{UNIX}/process_pool.py",
+        "self._loop.after(ANEW_SECONDS, lambda: self._order_anew(process))",
+        "pass",
+        PROCESS,
+        ("tests/process/test_process_pool.py",),
+    ),
+    SourceMutant(
         "a start is given up as fast as a step of a script",
         "G8",
         f"{RUNTIME}/deployment.py",

@@ -28,23 +28,36 @@ def end(failure):
     print(failure or "all parked")
     loop.end()
 
+class Full:
+    def send(self, order, fds):
+        raise BlockingIOError
+
 linux.become_subreaper()
 loop = EventLoop()
 ledger = UndoLedger(Path(sys.argv[1]), os.eventfd(0))
 pool = UnixProcessPool(loop, lambda process, report: None, restart, ledger)
 pool.start_zygote(LIGHT)
+{{what}}
+loop.tasks.start("spares", pool.parked_at_least(LIGHT, {OWED}), end)
+loop.run()
+"""
+DEAD: Final = f"""
 os.kill(pool.zygotes[LIGHT].pid, signal.SIGSTOP)  # it reads none of its orders
 pool.park(LIGHT, {OWED})
 os.kill(pool.zygotes[LIGHT].pid, signal.SIGKILL)
-loop.tasks.start("spares", pool.parked_at_least(LIGHT, {OWED}), end)
-loop.run()
+"""
+UNREAD: Final = f"""
+sound, pool.zygotes[LIGHT].line = pool.zygotes[LIGHT].line, Full()
+pool.park(LIGHT, {OWED})
+pool.zygotes[LIGHT].line = sound
 """
 
 
 @pytest.mark.process
-def test_a_new_zygote_forks_all_spares_that_its_predecessor_owed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("what", [DEAD, UNREAD], ids=["of a dead zygote", "of an order that was not sent"])
+def test_all_spares_that_were_ordered_are_parked_in_the_end(tmp_path: Path, what: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", SUPERVISOR, tmp_path],
+        [sys.executable, "-c", SUPERVISOR.format(what=what), tmp_path],
         capture_output=True,
         text=True,
         timeout=SECONDS_MAX,

@@ -29,6 +29,7 @@ from aftbed.runtime.unix.transport import Line, decode_report
 REAP_SECONDS: Final = 0.01  # a failover does not wait for the reaping of a dead process
 SPARE_SECONDS_MAX: Final = 5.0  # a zygote imports first
 DEMAND: Final = 3  # spares that are forked where one is waited for: the next ones are wanted soon
+ANEW_SECONDS: Final = 0.05  # from the end of a spare before its first message to the order of another one
 PARK_BATCH: Final = 8  # spares per order: the first of them start while the next are forked
 WATCHING_KINDS: Final = ("watchdog", "recovery")
 SERVER: Final = "server"  # the kind of brick that hosts the function
@@ -264,6 +265,8 @@ class UnixProcessPool:
                 got = None
             if got is None:
                 self._loop.forget(process.line.fileno())
+                if any(process in unborn for unborn in self._unborn.values()):
+                    self._loop.after(ANEW_SECONDS, lambda: self._order_anew(process))
                 return
             message, fds = got
             assert not fds, f"{process.name} sent descriptors"
@@ -276,6 +279,17 @@ class UnixProcessPool:
                 self._parked[zygote].append(process)
                 self._refill_next(zygote)
                 self._loop.tasks.settle(("spare", zygote, 0))
+
+    def _order_anew(self, process: UnixProcess) -> None:
+        """Have another spare forked for one that ended before its first message, or was never forked.
+
+        No pidfd shows its end, and all that need a spare would wait for it.
+        """
+        for zygote, unborn in self._unborn.items():
+            if process in unborn and self.zygotes[zygote].alive:  # a restart orders those of a dead one
+                self._forget(process)
+                self.park(zygote, 1)
+                return
 
     # -- death --------------------------------------------------------------------------------
 
