@@ -24,6 +24,7 @@ from typing import Final
 
 import command_process
 import msgspec
+import psutil
 import pytest
 from homes import (
     FORKED,
@@ -231,6 +232,13 @@ class Started:
             return False  # not listening yet
         return bool(status["backup"]) and not status["busy"]
 
+    def states(self) -> str:
+        """Its processes, spares and zygotes too, and what each waits for: where a run does not go on."""
+        found = psutil.Process(self.launched.supervisor).children(recursive=True)
+        return "".join(
+            f"    {one.pid} of {one.ppid()} {one.name()} {one.status()} {wait_of(one.pid)}\n" for one in found
+        )
+
     def descriptors(self, pid: int) -> int:
         """How many descriptors the process `pid` has open."""
         return len(list(Path(f"/proc/{pid}/fd").iterdir()))
@@ -266,6 +274,14 @@ def state_of(pid: int) -> str:
     """The state letter of proc(5), or `""` of a process that is gone."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return ""
+
+
+def wait_of(pid: int) -> str:
+    """Where in the kernel the process `pid` waits, or `""` of one that is gone."""
+    try:
+        return Path(f"/proc/{pid}/wchan").read_text()
     except OSError:
         return ""
 

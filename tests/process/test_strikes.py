@@ -9,11 +9,13 @@ exchanged.
 The process tier strikes at a sample drawn from a fixed seed, the deep tier everywhere.
 """
 
+import contextlib
 import itertools
 import random
 from collections.abc import Iterable
 from typing import Final
 
+import psutil
 import pytest
 from liveruns import Home, Outcome, Started, until
 from sampling import sampled as combinations
@@ -117,6 +119,8 @@ def walk(home: Home, placement: str, todo: Iterable[Strike]) -> int:
             except (AssertionError, HarnessError, pytest.fail.Exception) as error:
                 print(f"BROKEN at {done[-1]}, the last of {len(done)}: {error}")
                 print("".join(f"    {e['t_ms']} {e['event']} {e['text']}\n" for e in run.heard()[-40:]))
+                with contextlib.suppress(psutil.Error):  # the run has ended
+                    print(run.states())
                 survived -= 1
         survived += len(done)
     return survived
