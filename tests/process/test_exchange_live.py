@@ -78,7 +78,7 @@ def library(path: Path, step: int, *options: str) -> str:
 
 def update(source: str, code: int) -> str:
     """What the command says that exchanges the function for `source`, which ends with `code`."""
-    done = adapted("update", "app", "--to", source)
+    done = adapted("update", "app", "--to", source, "--may-fail")
     assert done.code == code, done.out + done.err
     return done.out + done.err
 
