@@ -325,7 +325,7 @@ class Launcher:
             words, private, started = self._wanted.get()
             try:
                 started.set_result(start_command(words, private))
-            except (ConfigError, OSError) as error:
+            except (ConfigError, OSError, ValueError) as error:  # ValueError: a null byte among the words
                 started.set_exception(error)
 
 
@@ -470,6 +470,8 @@ class PageRequest(BaseHTTPRequestHandler):
 
 def carry_out(words: str, private: Path, launcher: Launcher) -> tuple[int, str]:
     """The exit code and the output of `aftbed WORDS` for this run, as at a second terminal."""
+    if "\0" in words:
+        return 2, "a command has no null bytes"
     try:
         process = launcher.start(shlex.split(words), private)
     except ValueError:

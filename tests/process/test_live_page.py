@@ -189,6 +189,7 @@ def test_a_command_is_that_of_a_second_terminal(run: Command) -> None:
     assert code == 2 and "did you mean 'lfr'" in text
     assert told(shown, "doctor --clean") == (2, "doctor: adapt, inject, stop are allowed here")
     assert told(shown, "inject 'crash") == (2, "inject 'crash: quotation marks come in pairs")
+    assert told(shown, "inject crash\0") == (2, "a command has no null bytes")
     assert told(shown, "") == (2, "nothing: adapt, inject, stop are allowed here")
     assert told(shown, "stop")[0] == 0
     assert run.done().code == 0
