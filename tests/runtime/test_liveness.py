@@ -215,18 +215,25 @@ def test_a_death_is_seen_before_the_process_is_reaped(tmp_path: Path) -> None:
         assert not any(looks(node)[1:])
 
 
-def test_a_watchdog_sleeps_where_the_kernel_has_no_lifelines(tmp_path: Path) -> None:
+def test_where_the_kernel_has_no_lifelines_a_watchdog_sleeps_until_a_pidfd_reports_a_death(
+    tmp_path: Path,
+) -> None:
     """The end of the pipe of lifelines is no death, and is not polled again."""
     journal = tmp_path / "node.journal"
     JournalFile(journal, "node")
-    senses = ProcessSenses()
-    order = control.WatchNodes(1, "a", 1, ("node",), (str(journal),), (os.getpid(),))
-    senses.watch(order, [os.pidfd_open(os.getpid())], lambda node: None)
-    lifelines, pidfd = senses.fds()
-    assert select.select([lifelines], [], [], SECONDS_MAX)[0]
-    assert senses.died(lifelines) == []
-    assert senses.fds() == (pidfd,)
-    senses.forget()
+    with process(ASLEEP) as child:
+        senses = ProcessSenses()
+        order = control.WatchNodes(1, "a", 1, ("node",), (str(journal),), (child.pid,))
+        senses.watch(order, [os.pidfd_open(child.pid)], lambda node: None)
+        (deaths,) = senses.fds()
+        assert select.select([deaths], [], [], SECONDS_MAX)[0]
+        assert senses.died(deaths) == []
+        assert not select.select([deaths], [], [], 0)[0]
+        child.kill()
+        assert select.select([deaths], [], [], SECONDS_MAX)[0]
+        assert senses.died(deaths) == ["node"]
+        senses.forget()
+        assert senses.fds() == ()
 
 
 # -- a machine that does not let a process run ------------------------------------------------------

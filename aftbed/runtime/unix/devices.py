@@ -3,6 +3,7 @@ from.
 """
 
 import os
+import select
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -34,6 +35,7 @@ class ProcessSenses(Senses):
         self._pidfds: dict[int, str] = {}
         self._liveness: dict[str, Liveness] = {}
         self._lifelines: LifelineWatcher | None = None
+        self._deaths: select.epoll | None = None  # all of them: one descriptor to wait for
 
     def watch(self, order: control.WatchNodes, fds: list[int], died: Callable[[str], None]) -> None:
         """Watch these nodes and no others; `fds` are their pidfds. Deaths are read from `fds()`."""
@@ -42,31 +44,40 @@ class ProcessSenses(Senses):
         watched = zip(nodes, order.pids, order.journals, strict=True)
         self._liveness = {node: Liveness(pid, journal) for node, pid, journal in watched}
         self._lifelines = LifelineWatcher(order.journals)
+        self._deaths = select.epoll()
+        for fd in (self._lifelines.fd, *fds):
+            self._deaths.register(fd, select.EPOLLIN)
 
     def forget(self) -> None:
+        if self._deaths is not None:
+            self._deaths.close()
         for fd in self._pidfds:
             os.close(fd)
         for liveness in self._liveness.values():
             liveness.close()
         if self._lifelines is not None:
             self._lifelines.close()
-        self._pidfds, self._liveness, self._lifelines = {}, {}, None
+        self._pidfds, self._liveness, self._lifelines, self._deaths = {}, {}, None, None
 
     def fds(self) -> tuple[int, ...]:
-        """One pidfd per watched node, and all lifelines together."""
-        watcher = self._lifelines
-        lifelines = (watcher.fd,) if watcher is not None and not watcher.ended else ()
-        return (*lifelines, *self._pidfds)
+        return () if self._deaths is None else (self._deaths.fileno(),)
 
     def died(self, fd: int) -> list[str]:
-        """The nodes behind `fd`, which is readable, that have died."""
-        if self._lifelines is not None and fd == self._lifelines.fd:
-            return [self._nodes[index] for index in self._lifelines.died()]
-        return [self._pidfds[fd]]
+        """The nodes that have died: those that the lifelines tell of, or else those that the pidfds do."""
+        assert self._deaths is not None and self._lifelines is not None
+        ready, found = [fd for fd, _ in self._deaths.poll(0)], []
+        if self._lifelines.fd in ready:
+            found = [self._nodes[index] for index in self._lifelines.died()]
+            if self._lifelines.ended:
+                self._deaths.unregister(self._lifelines.fd)
+        return found or [self._pidfds[fd] for fd in ready if fd in self._pidfds]
 
     def look(self, now_ns: int) -> tuple[dict[str, int], bool]:
-        seen_ns = {node: liveness.seen_ns(now_ns) for node, liveness in self._liveness.items()}
-        return seen_ns, not all(liveness.idle for liveness in self._liveness.values())
+        seen_ns, busy = {}, False
+        for node, liveness in self._liveness.items():
+            seen_ns[node] = liveness.seen_ns(now_ns)
+            busy = busy or not liveness.idle
+        return seen_ns, busy
 
 
 class BusLink(CarLink):

@@ -65,9 +65,10 @@ class Starvation:
         if self._stat < 0:
             return ""
         try:
-            return os.pread(self._stat, _STATE_BYTES, 0).rpartition(b")")[2][1:2].decode()
+            stat = os.pread(self._stat, _STATE_BYTES, 0)
         except ProcessLookupError:
             return ""
+        return chr(stat[stat.rindex(b")") + 2])
 
     def starves(self, now_ns: int, state: str = "") -> bool:
         """Whether the process, which is not seen alive, is one that the machine does not let run.
@@ -115,21 +116,18 @@ class Liveness:
     def seen_ns(self, now_ns: int) -> int:
         """Look: when the node was last seen alive. Now, if the machine does not let it run; see the table."""
         before, self._activity = self._activity, self.header.activity()
-        state, waits = self._starvation.state(), not self._activity & 1
-        self.idle = state == "S" and waits and self._activity == before
-        if self.idle or (self._activity != before and state in RUNNING):
-            return self._alive(now_ns)
-        if self._starvation.starves(now_ns, state):
+        state, changed = self._starvation.state(), self._activity != before
+        self.idle = not changed and state == "S" and not before & 1
+        if self.idle or (changed and state in RUNNING):
+            if not self._seen:
+                self._starvation.forget()
+                self._seen = True
             self._seen_ns = now_ns
+        elif self._starvation.starves(now_ns, state):
+            self._seen_ns, self._seen = now_ns, False
         elif self._seen:
-            self._seen_ns = max(self._seen_ns, now_ns - LOOK_NS)
-        self._seen = False
+            self._seen_ns, self._seen = max(self._seen_ns, now_ns - LOOK_NS), False
         return self._seen_ns
-
-    def _alive(self, now_ns: int) -> int:
-        self._starvation.forget()
-        self._seen_ns, self._seen = now_ns, True
-        return now_ns
 
     def dying(self) -> bool:
         """Whether it is dead, or the kernel has begun to end it, which a pidfd does not show yet."""

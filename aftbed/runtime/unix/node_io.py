@@ -277,21 +277,20 @@ class UnixIO(NodeIO[Inlet, int]):
 
         `may_block`: these are the same every time, and nothing is due at a time.
         """
-        key = _open_ports(self._fronts)
-        found = self._polls.get(key) if may_block else None
+        ports = _open_ports(self._fronts)
+        key = (ports, others, may_block)
+        found = self._polls.get(key)
         if found is not None:
             return found
         inlets = [
             hosted.inputs[port]
-            for hosted, ports in zip(self._fronts, key, strict=True)
-            for port in ports
+            for hosted, names in zip(self._fronts, ports, strict=True)
+            for port in names
             if port in hosted.inputs
         ]
-        found = PollSet(inlets, others, may_block)
-        if may_block:
-            self._polls[key] = found
-            if found.single is not None:
-                self._inlets[key[0] if len(key) == 1 else key] = found.single
+        self._polls[key] = found = PollSet(inlets, others, may_block)
+        if found.single is not None:
+            self._inlets[ports[0] if len(ports) == 1 else ports] = found.single
         return found
 
     def mail_waits(self) -> bool:
