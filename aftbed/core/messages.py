@@ -404,7 +404,7 @@ UNREADABLE: Final = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)  #
 
 # For the hot path of a host, which checks the size and the errors itself.
 encode_unchecked: Callable[[Message], bytes] = msgspec.msgpack.Encoder().encode
-decode_unchecked: Callable[[bytes], WireMessage] = msgspec.msgpack.Decoder(WireMessage).decode
+decode_unchecked: Callable[[bytes | memoryview], WireMessage] = msgspec.msgpack.Decoder(WireMessage).decode
 
 
 def encode(message: Message) -> bytes:

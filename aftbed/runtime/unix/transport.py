@@ -41,7 +41,7 @@ STATE_NAME: Final = "aftbed-state"  # as /proc/PID/fd shows it
 WRITE_SECONDS_MAX: Final = 2.0  # a node that cannot write for so long takes itself for fenced
 
 
-def put(descriptor: int, data: bytes) -> None:
+def put(descriptor: int, data: bytes | memoryview) -> None:
     """Send `data`, however large. Raises OSError as write(2) does; then all of it has to be sent again."""
     if len(data) <= PACKET_BYTES_MAX:
         os.write(descriptor, data)
@@ -59,7 +59,7 @@ def take(descriptor: int) -> bytes:
     return read_file(fds[0]) if fds else data
 
 
-def send_in_file(sock: socket.socket, data: bytes, beside: bytes = ANNOUNCED) -> None:
+def send_in_file(sock: socket.socket, data: bytes | memoryview, beside: bytes = ANNOUNCED) -> None:
     """`data` as a memfd, in a packet of `beside`. Raises OSError as sendmsg(2) does."""
     assert len(data) <= STATE_BYTES_MAX, f"{len(data)} bytes"
     with open(os.memfd_create(STATE_NAME), "wb", buffering=0) as file:
@@ -67,7 +67,7 @@ def send_in_file(sock: socket.socket, data: bytes, beside: bytes = ANNOUNCED) ->
         sock.sendmsg([beside], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", [file.fileno()]))])
 
 
-def _write_whole(descriptor: int, data: bytes) -> None:
+def _write_whole(descriptor: int, data: bytes | memoryview) -> None:
     left = memoryview(data)
     while left:
         left = left[os.write(descriptor, left) :]
