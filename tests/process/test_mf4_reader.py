@@ -29,7 +29,8 @@ def waiting_reader(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], int]
     """A command that converts an MF4, and the process of its reader."""
     os.mkfifo(folder / "a.mf4")
     words = [sys.executable, "-m", "aftbed", "log", "convert", folder / "a.mf4", folder / "a.log"]
-    with subprocess.Popen(words, stderr=subprocess.PIPE) as command:
+    own = os.environ | {"TMPDIR": str(folder)}  # a command that is killed leaves its scratch directory there
+    with subprocess.Popen(words, stderr=subprocess.PIPE, env=own) as command:
         try:
             (folder / "a.mf4").write_bytes(b"MDF     4.10    ")  # waits until the command opens it
             yield command, until(lambda: reader_of(command.pid), "its reader")
