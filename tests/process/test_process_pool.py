@@ -29,6 +29,12 @@ def end(failure):
     loop.end()
 
 class Full:
+    def __init__(self, line):
+        self.line = line
+
+    def __getattr__(self, name):
+        return getattr(self.line, name)
+
     def send(self, order, fds):
         raise BlockingIOError
 
@@ -47,20 +53,38 @@ pool.park(LIGHT, {OWED})
 os.kill(pool.zygotes[LIGHT].pid, signal.SIGKILL)
 """
 UNREAD: Final = f"""
-sound, pool.zygotes[LIGHT].line = pool.zygotes[LIGHT].line, Full()
+sound = pool.zygotes[LIGHT].line
+pool.zygotes[LIGHT].line = Full(sound)
 pool.park(LIGHT, {OWED})
 pool.zygotes[LIGHT].line = sound
 """
 
 
-@pytest.mark.process
-@pytest.mark.parametrize("what", [DEAD, UNREAD], ids=["of a dead zygote", "of an order that was not sent"])
-def test_all_spares_that_were_ordered_are_parked_in_the_end(tmp_path: Path, what: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", SUPERVISOR.format(what=what), tmp_path],
+NEVER: Final = f"""
+pool.zygotes[LIGHT].line = Full(pool.zygotes[LIGHT].line)
+pool.park(LIGHT, {OWED})
+"""
+
+
+def supervise(what: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", SUPERVISOR.format(what=what), folder],
         capture_output=True,
         text=True,
         timeout=SECONDS_MAX,
         check=False,
     )
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("what", [DEAD, UNREAD], ids=["of a dead zygote", "of an order that was not sent"])
+def test_all_spares_that_were_ordered_are_parked_in_the_end(tmp_path: Path, what: str) -> None:
+    done = supervise(what, tmp_path)
     assert done.stdout == "all parked\n", done.stderr
+
+
+@pytest.mark.process
+def test_a_run_in_which_no_spare_comes_to_its_first_message_ends_with_the_reason(tmp_path: Path) -> None:
+    done = supervise(NEVER, tmp_path)
+    assert done.returncode == 1 and not done.stdout
+    assert "no process starts: 100 in a row ended before their first message" in done.stderr
