@@ -346,9 +346,9 @@ class UnixIO(NodeIO[Inlet, int]):
         node.wake_due(now_ns)
 
     def _patience_ms(self) -> float | None:
-        """The longest wait, in ms; None: until something comes."""
+        """The longest wait, in ms, which poll rounds up; None: until something comes."""
         due = self._node.deadline_ns()
-        return None if due is None else max(0.0, (due - _now()) / 1e6 + 0.999)
+        return None if due is None else max(0.0, (due - _now()) / 1e6)
 
     def _handle_packet(self, inlet: Inlet, raw: bytes) -> None:
         """Handle one packet, after the orders that wait."""
