@@ -3,6 +3,7 @@
 The load has a fixed rate, because a closed loop would hide requests that wait. `blackout_ms` is the time
 from the order to stop taking requests to the last acknowledgement that they are taken again: what a request
 meets that arrives at the worst moment. `worst_request_ms` is what the client saw, from the journals.
+`steps_ms` has what the steps of the commit take of the blackout, each from its begin to that of the next one.
 
 The limit is that of a failover, SIGKILL to a pidfd readable elsewhere (`recovery`): no brick can be replaced
 by another process sooner than the kernel takes to tell of the end of one. The two alternate; each round has a
@@ -22,6 +23,7 @@ from typing import Annotated, Final, NamedTuple
 import msgspec
 from msgspec import Meta
 
+from aftbed.adapt.planner import plan
 from aftbed.bench.cycle import RING_BYTES, ring_of, ring_us
 from aftbed.bench.recovery import DEATH, deaths_ms
 from aftbed.bench.rounds import ROUNDS, BesideLimit, Meanwhile, beside_limit, in_turn, shares
@@ -36,11 +38,12 @@ from aftbed.bench.runs import (
     wait_until_ready,
 )
 from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.core.events import Event
 from aftbed.core.graph import PLACEMENTS
-from aftbed.core.journal import EntryKind
+from aftbed.core.journal import EntryKind, Record
 from aftbed.core.messages import Goal
 from aftbed.core.progress import Show, unshown
-from aftbed.core.script import RECIPES
+from aftbed.core.script import RECIPES, Stage, flat
 from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import build, parse
 from aftbed.judge import checks
@@ -60,6 +63,7 @@ class AdaptationTimes(BesideLimit, frozen=True):
 
     prepare_ms: Percentiles
     blackout_ms: Percentiles
+    steps_ms: dict[str, Percentiles]
     total_ms: Percentiles
     bricks_changed: int
     bricks_total: int
@@ -80,6 +84,13 @@ class AdaptationResult(AdaptationTimes, frozen=True, kw_only=True):
     worst_request_ms: float
     ring_us: Percentiles
     machine: Meanwhile
+
+
+class _Commit(NamedTuple):
+    """The steps of a commit: how many are staged before it, and the name of each; several may have one."""
+
+    staged: int
+    names: tuple[str, ...]
 
 
 class _Round(NamedTuple):
@@ -114,8 +125,11 @@ def bench_adapt(
     there, back = ([one.there for one in found.figures], [one.back for one in found.figures])
     records = [record for one in found.figures for record in one.records]
     counts = [_requests(record) for record in records]
+    pairs = ((old, new), (new, old)) if all(back) else ((old, new),)
+    ways = [commit_of(one, other, placement, recipe) for one, other in pairs]
+    steps = [one for record in records for one in steps_ms(record, ways)]
     return AdaptationResult(
-        **msgspec.structs.asdict(_times(there, found.limits)),
+        **msgspec.structs.asdict(_times(there, found.limits, steps[:: len(ways)])),
         machine=found.machine,
         old=old,
         new=new,
@@ -123,7 +137,7 @@ def bench_adapt(
         recipe=recipe,
         adaptations=sum(map(len, there)) + sum(map(len, back)),
         rate_hz=RATE_HZ,
-        back=_times(back, found.limits) if all(back) else msgspec.UNSET,
+        back=_times(back, found.limits, steps[1::2]) if all(back) else msgspec.UNSET,
         requests={name: sum(count[name] for count in counts) for name in counts[0]},
         stuck=sum(count["lost"] > 0 for count in counts),
         worst_request_ms=round(max(max(latencies_us(r), default=0.0) for r in records) / 1e3, 3),
@@ -157,7 +171,36 @@ def _each_in_a_run(old: str, new: str, placement: str, recipe: str, count: int, 
     return found
 
 
-def _times(rounds: list[Outcomes], deaths: list[list[float]]) -> AdaptationTimes:
+def commit_of(old: str, new: str, placement: str, recipe: str) -> _Commit:
+    """The steps of the commit from the mechanism `old` to `new`."""
+    script = plan(build(old, placement), build(new, placement), recipe).script
+    staged = sum(isinstance(step, Stage) for step in flat(script.prepare))
+    kinds = [dict.fromkeys(type(one).__name__.lower() for one in flat((step,))) for step in script.commit]
+    return _Commit(staged, tuple(map("+".join, kinds)))
+
+
+def steps_ms(record: RunRecord, ways: Sequence[_Commit]) -> list[dict[str, float]]:
+    """How long each step of the commit took (ms), for each adaptation of a run; they went `ways` in turn."""
+    of_each: list[list[Record]] = []
+    for one in record.history.events(Event.ADAPT_STEP_ENTER, Event.ADAPT_STEP_EXIT):
+        if one.event is Event.ADAPT_STEP_ENTER and one.detail == 1:
+            of_each.append([])
+        of_each[-1].append(one)
+    found = []
+    for records, way in zip(of_each, itertools.cycle(ways), strict=False):
+        enters = [r.t_ns for r in records if r.event is Event.ADAPT_STEP_ENTER and r.detail > way.staged]
+        times: dict[str, float] = dict.fromkeys(way.names, 0.0)
+        for name, (begin_ns, end_ns) in zip(
+            way.names, itertools.pairwise([*enters, records[-1].t_ns]), strict=True
+        ):
+            times[name] += (end_ns - begin_ns) / 1e6
+        found.append(times)
+    return found
+
+
+def _times(
+    rounds: list[Outcomes], deaths: list[list[float]], steps: list[dict[str, float]]
+) -> AdaptationTimes:
     outcomes = [outcome for one in rounds for outcome in one]
 
     def part(name: str) -> Percentiles:
@@ -169,6 +212,7 @@ def _times(rounds: list[Outcomes], deaths: list[list[float]]) -> AdaptationTimes
     return AdaptationTimes(
         part("prepare_ms"),
         part("blackout_ms"),
+        {name: percentiles([one[name] for one in steps]) for name in steps[0]},
         part("total_ms"),
         changed,
         total,

@@ -94,7 +94,9 @@ def _adaptation(what: str, options: str, **goal: float) -> tuple[TableLine, ...]
     kept = dict.fromkeys(("lost", "duplicated", "reordered", "wrong"), 0.0)
     return (
         TableLine(f"{what}: no request is served for", command, "blackout_ms", "ms", OWN, OWN_RATIO, goal),
+        TableLine("its steps, p50", command, "steps_ms.*.p50", "ms"),
         TableLine("and back", command, "back.blackout_ms", "ms", OWN, f"back.{OWN_RATIO}", goal),
+        TableLine("its steps, p50", command, "back.steps_ms.*.p50", "ms"),
         TableLine("the requests meanwhile", command, "requests", goal=kept, counted=True),
     )
 

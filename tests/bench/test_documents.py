@@ -65,6 +65,10 @@ def test_an_adaptation(home: Home, tmp_path: Path) -> None:
     for one in (found, found["back"]):
         check_beside(one, DEATH, 1)
         assert set(one["prepare_ms"]) == set(one["blackout_ms"]) == set(one["total_ms"]) == QUANTILES
+        steps = [times["p50"] for times in one["steps_ms"].values()]
+        assert min(steps) > 0 and sum(steps) <= one["blackout_ms"]["p50"] + 0.01  # rounded
+    assert list(found["steps_ms"]) == ["suspend", "bind", "resume"]
+    assert list(found["back"]["steps_ms"]) == ["suspend", "bind+unbind", "resume"]
     assert (found["adaptations"], found["from"], found["to"]) == (2, "pbr", "pbr+tr")
     assert found["requests"]["lost"] == 0 and found["stuck"] == 0 and set(found["ring_us"]) == QUANTILES
     check_times_of_a_set(tmp_path / "times.json", found)

@@ -43,8 +43,9 @@ DOCUMENTS: Final[dict[str, Document]] = {  # by the first word of a command
     },
     "adapt": {
         "blackout_ms": TIMES,
+        "steps_ms": {"suspend": TIMES, "bind+unbind": TIMES},
         **BESIDE,
-        "back": {"blackout_ms": TIMES, "ratio": RATIO | {"rounds": 7}},
+        "back": {"blackout_ms": TIMES, "steps_ms": {"suspend": TIMES}, "ratio": RATIO | {"rounds": 7}},
         "requests": {"sent": 100, "lost": 1, "duplicated": 0, "reordered": 0, "wrong": 0},
         "stuck": 2,
     },
