@@ -14,7 +14,7 @@ from aftbed.runtime.tasks import Tasks
 STALL_NS: Final = 250_000_000  # woken later than this, a process was not merely waiting for its turn
 
 
-def _call(call: Callable[[], None]) -> None:
+def _call(call: Callable[[], object]) -> None:
     """Call `call`. An order to a process that is gone must not end the run: its death is noticed anyway."""
     with contextlib.suppress(StepFailed):
         call()
@@ -25,13 +25,13 @@ class EventLoop:
 
     def __init__(self) -> None:
         self._epoll = select.epoll()
-        self._readers: dict[int, tuple[bool, Callable[[], None]]] = {}
-        self._timers: list[tuple[int, int, Callable[[], None]]] = []
+        self._readers: dict[int, tuple[bool, Callable[[], object]]] = {}
+        self._timers: list[tuple[int, int, Callable[[], object]]] = []
         self._order = itertools.count()
         self._ended = False
         self.tasks = Tasks(self.now_ns)
 
-    def read(self, fd: int, call: Callable[[], None], *, patient: bool = False) -> None:
+    def read(self, fd: int, call: Callable[[], object], *, patient: bool = False) -> None:
         """Call `call` whenever `fd` is readable or has ended; if `patient`, after those that are not."""
         self._readers[fd] = (patient, call)
         self._epoll.register(fd, select.EPOLLIN)
@@ -41,7 +41,7 @@ class EventLoop:
         if self._readers.pop(fd, None) is not None:
             self._epoll.unregister(fd)
 
-    def after(self, seconds: float, call: Callable[[], None]) -> None:
+    def after(self, seconds: float, call: Callable[[], object]) -> None:
         due = time.monotonic_ns() + round(seconds * 1e9)
         heapq.heappush(self._timers, (due, next(self._order), call))
 

@@ -256,31 +256,31 @@ class UnixProcessPool:
         process.born(pid)
         self._loop.read(process.pidfd, lambda: self._died(process), patient=True)
 
-    def _read_line(self, process: UnixProcess) -> None:
-        """Handle all messages that are there. The end of a line is no death: the pidfd shows that."""
-        while process.alive:
-            try:
-                got = process.line.recv()
-            except BlockingIOError:
-                return
-            except OSError:
-                got = None
-            if got is None:
-                self._loop.forget(process.line.fileno())
-                self._loop.after(ANEW_SECONDS, lambda: self._order_anew(process))
-                return
-            message, fds = got
-            assert not fds, f"{process.name} sent descriptors"
-            if not isinstance(message, control.Hello):
-                self._on_report(process, message)
-            elif process.kind is ProcessKind.SPARE and not process.pid:
-                self._stillborn = 0
-                self._born(process, message.pid)
-                zygote = next(name for name, unborn in self._unborn.items() if process in unborn)
-                self._unborn[zygote].remove(process)
-                self._parked[zygote].append(process)
-                self._refill_next(zygote)
-                self._loop.tasks.settle(("spare", zygote, 0))
+    def _read_line(self, process: UnixProcess) -> bool:
+        """Handle one message; False if there is none. The end of a line is no death: the pidfd shows that."""
+        try:
+            got = process.line.recv()
+        except BlockingIOError:
+            return False
+        except OSError:
+            got = None
+        if got is None:
+            self._loop.forget(process.line.fileno())
+            self._loop.after(ANEW_SECONDS, lambda: self._order_anew(process))
+            return False
+        message, fds = got
+        assert not fds, f"{process.name} sent descriptors"
+        if not isinstance(message, control.Hello):
+            self._on_report(process, message)
+        elif process.kind is ProcessKind.SPARE and not process.pid:
+            self._stillborn = 0
+            self._born(process, message.pid)
+            zygote = next(name for name, unborn in self._unborn.items() if process in unborn)
+            self._unborn[zygote].remove(process)
+            self._parked[zygote].append(process)
+            self._refill_next(zygote)
+            self._loop.tasks.settle(("spare", zygote, 0))
+        return process.alive
 
     def _order_anew(self, process: UnixProcess) -> None:
         """Have another spare forked if this is one that ended before its first message, or was never forked.
@@ -303,7 +303,8 @@ class UnixProcessPool:
     # -- death --------------------------------------------------------------------------------
 
     def _died(self, process: UnixProcess) -> None:
-        self._read_line(process)  # its last messages are still in the line
+        while self._read_line(process):  # its last messages
+            pass
         self._loop.forget(process.pidfd)
         process.alive = False
         self._on_death(process)
