@@ -218,16 +218,22 @@ class Deployment:
         return process
 
     def order(
-        self, host: str | Process, make: Callable[[int], control.ToNode], fds: tuple[int, ...] = ()
+        self,
+        host: str | Process,
+        make: Callable[[int], control.ToNode],
+        fds: tuple[int, ...] = (),
+        *,
+        suspended: bool = False,
     ) -> Sent:
         """Send an order to a node, or to a process that is staged or was exchanged, and wake it.
 
-        Raises StepFailed if it is gone.
+        One that is `suspended` waits for orders: no channel has to wake it. Raises StepFailed if it is gone.
         """
         process = self.process(host) if isinstance(host, str) else host
         self._tokens += 1
         self._send(process, make(self._tokens), fds)
-        self._nudge(process.name)
+        if not suspended:
+            self._nudge(process.name)
         return ("ack", process.name, self._tokens), process.name
 
     def leave(self, node: str, order: control.ToNode, fds: tuple[int, ...] = ()) -> None:

@@ -584,7 +584,8 @@ class Execution:
         sent = []
         for step in steps:
             before_ns = self._runtime.loop.now_ns()
-            sent.append(self._deployment.order(self._rebinding.host(step.brick), control.ResumeNode))
+            host = self._rebinding.host(step.brick)
+            sent.append(self._deployment.order(host, control.ResumeNode, suspended=True))
             self.done.append(step)
             if step.brick == f"{self._deployment.leader}/protocol":
                 self.turned_ns = before_ns
