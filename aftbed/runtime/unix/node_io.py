@@ -73,18 +73,18 @@ _VIEWS: Final = tuple([_BUFFER[:size] for size in range(_SHORT)])  # of short pa
 
 
 class Inlet:
-    """The reading end of a channel. `read_into`: the bytes of the next packet that found room in a buffer."""
+    """The reading end of a channel."""
 
-    __slots__ = ("fd", "hosted", "port", "read_into")
+    __slots__ = ("fd", "hosted", "port")
 
     def __init__(self, hosted: "UnixBrick", port: str, fd: int) -> None:
         self.hosted, self.port, self.fd = hosted, port, fd
-        self.read_into = io.FileIO(fd, closefd=False).readinto
 
 
 UnixBrick = HostedBrick[Inlet, int]
 UnixNode = Node[Inlet, int]
 OpenPorts = tuple[str, ...] | tuple[tuple[str, ...], ...]  # of the one brick with inlets, or of each
+ReadInto = Callable[[memoryview], int]  # the next packet, into a buffer; how many bytes it has
 
 
 class PollSet:
@@ -123,7 +123,7 @@ class UnixIO(NodeIO[Inlet, int]):
         self._fast = False  # served by the fast loop
         self._fronts: list[UnixBrick] = []  # bricks with inlets
         self._polls: dict[tuple[object, ...], PollSet] = {}  # by the arguments of `_poll_set`, and open ports
-        self._inlets: dict[OpenPorts, Inlet] = {}  # by open ports, those where only one inlet is open
+        self._inlets: dict[OpenPorts, tuple[Inlet, ReadInto]] = {}  # by open ports, where one inlet is open
 
     def join(self, node: UnixNode) -> None:
         self._node = node
@@ -220,11 +220,12 @@ class UnixIO(NodeIO[Inlet, int]):
                     mail.popleft()
                     read = None
                 else:
-                    inlet = inlets.get(open_ports())
-                    if inlet is None or (device is not None and node.step_device(device)):
+                    found = inlets.get(open_ports())
+                    if found is None or (device is not None and node.step_device(device)):
                         return
+                    inlet, read_into = found
                     mapping[ACTIVITY_OFFSET] = activity = (activity + 1) & 254
-                    size = inlet.read_into(buffer)
+                    size = read_into(buffer)
                     mapping[ACTIVITY_OFFSET] = activity = activity + 1
                     if not 2 <= size < READ_BYTES_MAX or mapping[FLAG_OFFSET] or at > journal.end:
                         self._handle_packet(inlet, bytes(buffer[:size]))
@@ -299,7 +300,8 @@ class UnixIO(NodeIO[Inlet, int]):
         ]
         self._polls[key] = found = PollSet(inlets, others, may_block)
         if found.single is not None:
-            self._inlets[ports[0] if len(ports) == 1 else ports] = found.single
+            read_into = io.FileIO(found.single.fd, closefd=False).readinto
+            self._inlets[ports[0] if len(ports) == 1 else ports] = found.single, read_into
         return found
 
     def mail_waits(self) -> bool:
