@@ -68,7 +68,8 @@ class Starvation:
             stat = os.pread(self._stat, _STATE_BYTES, 0)
         except ProcessLookupError:
             return ""
-        return chr(stat[stat.rindex(b")") + 2])
+        at = stat.rfind(b")") + 2
+        return stat[at : at + 1].decode()
 
     def starves(self, now_ns: int, state: str = "") -> bool:
         """Whether the process, which is not seen alive, is one that the machine does not let run.
