@@ -11,6 +11,7 @@ from typing import Final
 from aftbed.core.errors import StepFailed
 from aftbed.runtime.tasks import Tasks
 
+LOOK_AROUND_NS: Final = 1_000_000_000
 STALL_NS: Final = 250_000_000  # woken later than this, a process was not merely waiting for its turn
 
 
@@ -29,6 +30,7 @@ class EventLoop:
         self._timers: list[tuple[int, int, Callable[[], object]]] = []
         self._order = itertools.count()
         self._ended = False
+        self._polled_ns = time.monotonic_ns()
         self.tasks = Tasks(self.now_ns)
 
     def read(self, fd: int, call: Callable[[], object], *, patient: bool = False) -> None:
@@ -57,11 +59,12 @@ class EventLoop:
 
     def run(self) -> None:
         while not self._ended:
-            patience_s = self._patience_seconds()
-            due_ns = time.monotonic_ns() + round(patience_s * 1e9)
-            polled = self._epoll.poll(patience_s)
+            due_ns = self._due_ns()
+            polled = self._epoll.poll(max(0.0, (due_ns - time.monotonic_ns()) / 1e9))
             now_ns = time.monotonic_ns()  # before the calls: what arrives while they run is not late yet
-            if now_ns - due_ns > STALL_NS:
+            stalled = now_ns - max(due_ns, self._polled_ns) > STALL_NS  # in the wait, or since the last one
+            self._polled_ns = now_ns
+            if stalled:
                 self.tasks.begin_anew()
             ready = [(fd, self._readers[fd]) for fd, _ in polled if fd in self._readers]
             for turn in (False, True):
@@ -73,11 +76,12 @@ class EventLoop:
             while self._timers and self._timers[0][0] <= now_ns:
                 _call(heapq.heappop(self._timers)[2])
 
-    def _patience_seconds(self) -> float:
-        dues = [self._timers[0][0]] if self._timers else []
+    def _due_ns(self) -> int:
+        """When to look around at the latest."""
+        dues = [self._polled_ns + LOOK_AROUND_NS]
+        if self._timers:
+            dues.append(self._timers[0][0])
         job = self.tasks.deadline_ns()
         if job is not None:
             dues.append(job)
-        if not dues:
-            return 1.0
-        return min(1.0, max(0.0, (min(dues) - time.monotonic_ns()) / 1e9))
+        return min(dues)
