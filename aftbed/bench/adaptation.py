@@ -126,8 +126,8 @@ def bench_adapt(
     records = [record for one in found.figures for record in one.records]
     counts = [_requests(record) for record in records]
     pairs = ((old, new), (new, old)) if all(back) else ((old, new),)
-    ways = [commit_of(one, other, placement, recipe) for one, other in pairs]
-    steps = [one for record in records for one in steps_ms(record, ways)]
+    ways = [_commit_of(one, other, placement, recipe) for one, other in pairs]
+    steps = [one for record in records for one in _steps_ms(record, ways)]
     return AdaptationResult(
         **msgspec.structs.asdict(_times(there, found.limits, steps[:: len(ways)])),
         machine=found.machine,
@@ -171,7 +171,7 @@ def _each_in_a_run(old: str, new: str, placement: str, recipe: str, count: int, 
     return found
 
 
-def commit_of(old: str, new: str, placement: str, recipe: str) -> _Commit:
+def _commit_of(old: str, new: str, placement: str, recipe: str) -> _Commit:
     """The steps of the commit from the mechanism `old` to `new`."""
     script = plan(build(old, placement), build(new, placement), recipe).script
     staged = sum(isinstance(step, Stage) for step in flat(script.prepare))
@@ -179,7 +179,7 @@ def commit_of(old: str, new: str, placement: str, recipe: str) -> _Commit:
     return _Commit(staged, tuple(map("+".join, kinds)))
 
 
-def steps_ms(record: RunRecord, ways: Sequence[_Commit]) -> list[dict[str, float]]:
+def _steps_ms(record: RunRecord, ways: Sequence[_Commit]) -> list[dict[str, float]]:
     """How long each step of the commit took (ms), for each adaptation of a run; they went `ways` in turn."""
     of_each: list[list[Record]] = []
     for one in record.history.events(Event.ADAPT_STEP_ENTER, Event.ADAPT_STEP_EXIT):

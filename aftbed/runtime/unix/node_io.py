@@ -66,7 +66,8 @@ _pack = RECORD.pack_into
 RECORD_BYTES: Final = RECORD.size
 
 
-# The fast loop reads into one buffer: a new object of READ_BYTES_MAX for each packet costs 1.3 % of a cycle.
+# The fast loop reads into one buffer: a new object of READ_BYTES_MAX for each packet costs 1.3 % of a cycle,
+# and a view that is made for each takes as long. What is in it is valid until the next read.
 _BUFFER: Final = memoryview(bytearray(READ_BYTES_MAX))
 _SHORT: Final = 512
 _VIEWS: Final = tuple([_BUFFER[:size] for size in range(_SHORT)])  # of short packets, by their size

@@ -30,7 +30,7 @@ REAP_SECONDS: Final = 0.01  # a failover does not wait for the reaping of a dead
 SPARE_SECONDS_MAX: Final = 5.0  # a zygote imports first
 DEMAND: Final = 3  # spares that are forked where one is waited for: the next ones are wanted soon
 ANEW_SECONDS: Final = 0.05  # from the end of a spare before its first message to the order of another one
-STILLBORN_MAX: Final = 100  # spares in a row that end so
+EARLY_ENDS_MAX: Final = 100  # spares in a row that end so
 PARK_BATCH: Final = 8  # spares per order: the first of them start while the next are forked
 WATCHING_KINDS: Final = ("watchdog", "recovery")
 SERVER: Final = "server"  # the kind of brick that hosts the function
@@ -166,7 +166,7 @@ class UnixProcessPool:
         self._parked: dict[str, deque[UnixProcess]] = {}  # by zygote
         self._unborn: dict[str, list[UnixProcess]] = {}  # ordered from their zygote, not seen yet
         self._levels: dict[str, int] = {}  # to which spares are refilled
-        self._stillborn = 0  # spares in a row that ended before their first message
+        self._early_ends = 0  # spares in a row that ended before their first message
 
     def start_zygote(self, name: str, started: Started | None = None) -> None:
         """Take over a zygote that was started already, or start one."""
@@ -266,14 +266,15 @@ class UnixProcessPool:
             got = None
         if got is None:
             self._loop.forget(process.line.fileno())
-            self._loop.after(ANEW_SECONDS, lambda: self._order_anew(process))
+            if not process.pid:
+                self._loop.after(ANEW_SECONDS, lambda: self._order_anew(process))
             return False
         message, fds = got
         assert not fds, f"{process.name} sent descriptors"
         if not isinstance(message, control.Hello):
             self._on_report(process, message)
         elif process.kind is ProcessKind.SPARE and not process.pid:
-            self._stillborn = 0
+            self._early_ends = 0
             self._born(process, message.pid)
             zygote = next(name for name, unborn in self._unborn.items() if process in unborn)
             self._unborn[zygote].remove(process)
@@ -283,17 +284,17 @@ class UnixProcessPool:
         return process.alive
 
     def _order_anew(self, process: UnixProcess) -> None:
-        """Have another spare forked if this is one that ended before its first message, or was never forked.
+        """Have another spare forked for one that ended before its first message, or was never forked.
 
         No pidfd shows its end, and all that need a spare would wait for it. Raises HarnessError where spare
         after spare ends so.
         """
         for zygote, unborn in self._unborn.items():
             if process in unborn and self.zygotes[zygote].alive:  # a restart orders those of a dead one
-                self._stillborn += 1
-                if self._stillborn > STILLBORN_MAX:
+                self._early_ends += 1
+                if self._early_ends > EARLY_ENDS_MAX:
                     raise HarnessError(
-                        f"no process starts: {STILLBORN_MAX} in a row ended before their first message; "
+                        f"no process starts: {EARLY_ENDS_MAX} in a row ended before their first message; "
                         "dmesg shows whether the kernel killed them"
                     )
                 self._forget(process)
