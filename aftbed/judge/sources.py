@@ -29,6 +29,7 @@ from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
 from aftbed.functions.source import is_foreign
 from aftbed.inject.receipts import fault_and_bits
+from aftbed.inject.targets import SUPERVISOR
 from aftbed.judge.bare_server import ReferenceRun
 from aftbed.judge.record import RunEnd, RunRecord
 from aftbed.runtime.deployment import digest
@@ -341,16 +342,20 @@ def _of_adaptations(record: RunRecord) -> Iterator[str]:
 
 
 def _of_faults(record: RunRecord) -> Iterator[str]:
-    """What was asked for, what has a receipt, what has struck."""
+    """What was asked for, what has a receipt, what has struck. What the supervisor does, it does once."""
     told = [report.fault for report in record.faults if not report.live]
     if told != [str(fault) for fault in record.options.faults]:
         yield f"the receipts are not those of the faults that were asked for with the run: {told}"
-    numbers = {fault_and_bits(r.detail)[0] - FIRST_FAULT for r in record.history.events(Event.FAULT_APPLIED)}
+    strikes = record.history.events(Event.FAULT_APPLIED)
+    numbers = {fault_and_bits(strike.detail)[0] - FIRST_FAULT for strike in strikes}
+    acts = Counter(strike.detail - FIRST_FAULT for strike in strikes if strike.node == SUPERVISOR)
     counted = Counter(report.number for report in record.faults)
     if twice := [number for number, count in counted.items() if count > 1]:
         yield f"two receipts have the number of one fault: number {min(twice) + 1}"
     if struck := numbers - counted.keys():
         yield f"a fault has struck, and there is no receipt: number {min(struck) + 1}"
+    if again := [number for number, count in acts.items() if count > 1]:
+        yield f"the supervisor has applied one fault {acts[min(again)]} times: number {min(again) + 1}"
 
 
 def _of_policy(record: RunRecord) -> Iterator[str]:

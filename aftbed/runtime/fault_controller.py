@@ -196,10 +196,18 @@ class FaultController:
         return host.alive and self._deployment.nodes.get(roles.graph.node_of(brick)) is host
 
     def _withdraw(self, injection: RunInjection, host: Process) -> Keys:
-        """Its host no longer emits its event, or is dead."""
+        """Its host no longer emits its event, was replaced, or is dead.
+
+        One that was replaced is suspended, and serves again if the adaptation is undone: it reads this
+        before its Resume.
+        """
+        deployment = self._deployment
         injection.move_out(self._runtime.records(host.journal))
-        if host.alive and self._deployment.nodes.get(host.name) is host:
-            yield from self._deployment.ask(host.name, lambda token: injection.order(token, 0))
+        if not host.alive:
+            return
+        sent = deployment.order(host, lambda token: injection.order(token, 0))
+        if deployment.nodes.get(host.name) is host:
+            yield from deployment.answers([sent])
 
     def rearm(self) -> Keys:
         """After a change of roles, or of the graph: move what waits in a node that no longer emits its

@@ -409,3 +409,15 @@ def test_a_fault_has_the_number_that_the_journals_have(path: Path) -> None:
     record.end["faults"] = [crash, crash]
     twice = "sources_agree: two receipts have the number of one fault: number 2"
     assert twice in record.verdict().reasons
+
+
+def test_a_fault_that_the_supervisor_applies_again_is_an_error_of_the_run(path: Path) -> None:
+    record = whole(path)
+    record.note("a.after.1", Event.FAULT_APPLIED, detail=FIRST_FAULT)
+    record.note("supervisor.1", Event.FAULT_APPLIED, detail=FIRST_FAULT)
+    assert record.end is not None
+    record.end["faults"] = [{"fault": str(CRASH), "receipt": "activated", "live": True}]
+    assert record.verdict().checks["sources_agree"] == "pass"
+    record.note("supervisor.1", Event.FAULT_APPLIED, detail=FIRST_FAULT)
+    twice = "sources_agree: the supervisor has applied one fault 2 times: number 1"
+    assert twice in record.verdict().reasons

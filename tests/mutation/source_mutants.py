@@ -1130,6 +1130,15 @@ MUTANTS: Final = (
         UNIT,
         ("tests/sim/test_replacements.py::test_a_start_waits_for_a_watchdog_that_gets_no_cpu",),
     ),
+    SourceMutant(
+        "a process that an adaptation replaced stays armed, and strikes again when it is put back",
+        "G8",
+        f"{RUNTIME}/fault_controller.py",
+        "        if not host.alive:\n            return\n        sent",
+        "        if deployment.nodes.get(host.name) is not host:\n            return\n        sent",
+        UNIT,
+        ("tests/sim/test_injectors.py",),
+    ),
 )
 
 

@@ -405,6 +405,20 @@ def test_a_fault_strikes_while_an_adaptation_is_observed() -> None:
     assert [o.outcome for o in run.adaptations] == ["rolled back"]
 
 
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_a_fault_strikes_once_though_the_process_that_it_waited_in_serves_again(placement: str) -> None:
+    """It strikes from the new Before. So the adaptation is undone, and the old one comes to the point."""
+    adaptation = (Scheduled(Goal(expression="lfr"), 4),)
+    faults = (parse("crash backup at before.exit nth 8"),)
+    run = World(Setup("pbr", placement, 1, COUNT, RATE_HZ, faults, adaptation)).run()
+    assert [o.outcome for o in run.adaptations] == ["rolled back"]
+    assert receipts(run) == ["activated"]
+    strikes = [r for r in run.history.events(Event.FAULT_APPLIED) if r.node == "supervisor"]
+    assert len(strikes) == 1
+    after = [r for r in run.history.events(Event.BEFORE_EXIT) if r.t_ns > strikes[0].t_ns]
+    assert len(after) > 2 * 8
+
+
 @pytest.mark.parametrize("after_ms", [13.0, 31.0, 40.0])
 def test_a_death_that_is_seen_late_is_that_of_a_process_that_was_exchanged_meanwhile(
     monkeypatch: pytest.MonkeyPatch, after_ms: float
