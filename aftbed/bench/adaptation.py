@@ -5,6 +5,9 @@ from the order to stop taking requests to the last acknowledgement that they are
 meets that arrives at the worst moment. `worst_request_ms` is what the client saw, from the journals.
 `steps_ms` has what the steps of the commit take of the blackout, each from its begin to that of the next one.
 
+An update exchanges the function, under the same mechanism: two versions with a state of some size (`ballast`)
+replace each other.
+
 The limit is that of a failover, SIGKILL to a pidfd readable elsewhere (`recovery`): no brick can be replaced
 by another process sooner than the kernel takes to tell of the end of one. The two alternate; each round has a
 run of its own.
@@ -17,18 +20,21 @@ import itertools
 import math
 import time
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple
 
 import msgspec
 from msgspec import Meta
 
-from aftbed.adapt.planner import plan
+from aftbed.adapt.planner import APPLICATION, plan
+from aftbed.bench import ballast
 from aftbed.bench.cycle import RING_BYTES, ring_of, ring_us
 from aftbed.bench.recovery import DEATH, deaths_ms
 from aftbed.bench.rounds import ROUNDS, BesideLimit, Meanwhile, beside_limit, in_turn, shares
 from aftbed.bench.runs import (
     PAUSE_SECONDS,
+    EndlessRun,
     Log,
     Percentiles,
     endless_run,
@@ -39,18 +45,17 @@ from aftbed.bench.runs import (
 )
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.events import Event
-from aftbed.core.graph import PLACEMENTS
+from aftbed.core.graph import PLACEMENTS, Graph
 from aftbed.core.journal import EntryKind, Record
 from aftbed.core.messages import Goal
 from aftbed.core.progress import Show, unshown
 from aftbed.core.script import RECIPES, Stage, flat
 from aftbed.core.yaml_file import read_yaml
-from aftbed.ftm.compose import build, parse
+from aftbed.ftm.compose import build, parse, protected_by
 from aftbed.judge import checks
 from aftbed.judge.isolated import reference_of
 from aftbed.judge.record import RunRecord
 from aftbed.runtime.unix import control_client
-from aftbed.vehicle.aeb.function import default_application
 
 RATE_HZ: Final = 200.0
 RING_COUNT: Final = 500
@@ -74,6 +79,7 @@ class AdaptationResult(AdaptationTimes, frozen=True, kw_only=True):
 
     old: str = msgspec.field(name="from")
     new: str = msgspec.field(name="to")
+    update_bytes: int | msgspec.UnsetType = msgspec.UNSET  # of the state of the function that is updated
     placement: str
     recipe: str
     adaptations: int
@@ -84,6 +90,14 @@ class AdaptationResult(AdaptationTimes, frozen=True, kw_only=True):
     worst_request_ms: float
     ring_us: Percentiles
     machine: Meanwhile
+
+
+class _Way(NamedTuple):
+    """An adaptation from one graph to another, and the goal that asks for it."""
+
+    old: Graph
+    new: Graph
+    goal: Goal
 
 
 class _Commit(NamedTuple):
@@ -108,31 +122,38 @@ def bench_adapt(
     recipe: str,
     count: int,
     *,
+    update_bytes: int = 0,
     pin: bool = True,
     rounds: int = ROUNDS,
     show: Show = unshown,
 ) -> AdaptationResult:
-    """Adapt `count` times, and back as often. Raises HarnessError."""
-    ring = ring_us(ring_of(build(old, placement)), RING_BYTES, RING_COUNT, pin=pin)
+    """Adapt `count` times, and back as often. Raises HarnessError.
+
+    With `update_bytes`, `old` is `new`, and a function whose state has so many bytes is updated.
+    """
+    ways = _versions(old, placement, update_bytes) if update_bytes else _mechanisms(old, new, placement)
+    if recipe != RECIPES[0]:
+        ways = [way._replace(goal=msgspec.structs.replace(way.goal, recipe=recipe)) for way in ways[:1]]
+    ring = ring_us(ring_of(ways[0].old), RING_BYTES, RING_COUNT, pin=pin)
     share = shares(count, rounds)
 
     def adaptations(number: int) -> _Round:
         if recipe == RECIPES[0]:
-            return _there_and_back(old, new, placement, share[number], pin=pin)
-        return _each_in_a_run(old, new, placement, recipe, share[number], pin=pin)
+            return _there_and_back(ways, share[number], pin=pin)
+        return _each_in_a_run(ways[0], share[number], pin=pin)
 
     found = in_turn(len(share), adaptations, lambda number: deaths_ms(share[number], pin=pin), show=show)
     there, back = ([one.there for one in found.figures], [one.back for one in found.figures])
     records = [record for one in found.figures for record in one.records]
     counts = [_requests(record) for record in records]
-    pairs = ((old, new), (new, old)) if all(back) else ((old, new),)
-    ways = [_commit_of(one, other, placement, recipe) for one, other in pairs]
-    steps = [one for record in records for one in _steps_ms(record, ways)]
+    commits = [_commit_of(way) for way in ways]
+    steps = [one for record in records for one in _steps_ms(record, commits)]
     return AdaptationResult(
         **msgspec.structs.asdict(_times(there, found.limits, steps[:: len(ways)])),
         machine=found.machine,
         old=old,
         new=new,
+        update_bytes=update_bytes or msgspec.UNSET,
         placement=placement,
         recipe=recipe,
         adaptations=sum(map(len, there)) + sum(map(len, back)),
@@ -145,35 +166,55 @@ def bench_adapt(
     )
 
 
-def _there_and_back(old: str, new: str, placement: str, count: int, *, pin: bool) -> _Round:
+def _mechanisms(old: str, new: str, placement: str) -> list[_Way]:
+    """From one mechanism to another, and back."""
+    first, second = build(old, placement), build(new, placement)
+    return [_Way(first, second, Goal(expression=new)), _Way(second, first, Goal(expression=old))]
+
+
+def _versions(ftm: str, placement: str, size_bytes: int) -> list[_Way]:
+    """From one version of a function with so much state to the next one, and back."""
+    sources = [ballast.source_of(size_bytes, version) for version in ballast.VERSIONS]
+    first, second = (build(ftm, placement, application=source) for source in sources)
+    return [
+        _Way(first, second, Goal(part=APPLICATION, source=sources[1])),
+        _Way(second, first, Goal(part=APPLICATION, source=sources[0])),
+    ]
+
+
+def _run_of(way: _Way, *, pin: bool) -> AbstractContextManager[EndlessRun]:
+    graph = way.old
+    return endless_run(graph.ftm, graph.placement, RATE_HZ, application=protected_by(graph), pin=pin)
+
+
+def _there_and_back(ways: Sequence[_Way], count: int, *, pin: bool) -> _Round:
     """In one run."""
     there: Outcomes = []
     back: Outcomes = []
-    with endless_run(old, placement, RATE_HZ, pin=pin) as run:
+    with _run_of(ways[0], pin=pin) as run:
         wait_until_ready(run.private)
         for _ in range(count):
-            there.append(adapted(run.private, Goal(expression=new, recipe=RECIPES[0])))
-            time.sleep(PAUSE_SECONDS)
-            back.append(adapted(run.private, Goal(expression=old)))
-            time.sleep(PAUSE_SECONDS)
+            for way, outcomes in zip(ways, (there, back), strict=True):
+                outcomes.append(adapted(run.private, way.goal))
+                time.sleep(PAUSE_SECONDS)
     return _Round(there, back, [run.record])
 
 
-def _each_in_a_run(old: str, new: str, placement: str, recipe: str, count: int, *, pin: bool) -> _Round:
+def _each_in_a_run(way: _Way, count: int, *, pin: bool) -> _Round:
     """There only, since it may be the last thing that the run does."""
     found = _Round([], [], [])
     for _ in range(count):
-        with endless_run(old, placement, RATE_HZ, pin=pin) as run:
+        with _run_of(way, pin=pin) as run:
             wait_until_ready(run.private)
-            found.there.append(adapted(run.private, Goal(expression=new, recipe=recipe)))
+            found.there.append(adapted(run.private, way.goal))
             time.sleep(PAUSE_SECONDS)
         found.records.append(run.record)
     return found
 
 
-def _commit_of(old: str, new: str, placement: str, recipe: str) -> _Commit:
-    """The steps of the commit from the mechanism `old` to `new`."""
-    script = plan(build(old, placement), build(new, placement), recipe).script
+def _commit_of(way: _Way) -> _Commit:
+    """The steps of its commit."""
+    script = plan(way.old, way.new, way.goal.recipe).script
     staged = sum(isinstance(step, Stage) for step in flat(script.prepare))
     kinds = [dict.fromkeys(type(one).__name__.lower() for one in flat((step,))) for step in script.commit]
     return _Commit(staged, tuple(map("+".join, kinds)))
@@ -223,7 +264,7 @@ def _times(
 
 def _requests(record: RunRecord) -> dict[str, int]:
     """What became of the requests of a run; `reordered`: replies that came after one of a later request."""
-    counts = checks.requests(record.history, reference_of(record, default_application))
+    counts = checks.requests(record.history, reference_of(record))
     ids = [e.request_id for e in record.history.dialogue if e.kind is EntryKind.ANSWERED]
     reordered = sum(after < before for before, after in itertools.pairwise(ids))
     return {
@@ -336,6 +377,8 @@ def read_times(path: Path) -> dict[Pair, AdaptationTime]:
             parse(name)
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
+    if found.old == found.new:
+        raise ConfigError(f"{where}: an update; allowed is an adaptation to another mechanism")
     if (found.recipe, found.placement) != (RECIPES[0], PLACEMENTS[0]):
         raise ConfigError(
             f"{where}: found recipe {found.recipe}, placement {found.placement};"

@@ -131,6 +131,7 @@ LINES: Final = (
     _recovery("the same under `lfr`", "--ftm lfr"),
     *_adaptation("composition `pbr` to `pbr+tr`", "--from pbr --to pbr+tr", p50=1.2, p99=3.0),
     *_adaptation("switch `pbr` to `lfr`", "--from pbr --to lfr", p50=1.5, p99=4.0),
+    *_adaptation("update of a function with 1 kB of state", "--from pbr --update 1000", p50=1.5)[:2],
     TableLine(
         "the same by the paper's recipe (the paper: 300 ms)", RECIPE, "blackout_ms", "ms", OWN, OWN_RATIO
     ),

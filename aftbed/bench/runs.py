@@ -151,9 +151,11 @@ class EndlessRun:
 
 
 @contextlib.contextmanager
-def endless_run(ftm: str, placement: str, rate_hz: float = 0.0, *, pin: bool = True) -> Iterator[EndlessRun]:
+def endless_run(
+    ftm: str, placement: str, rate_hz: float = 0.0, *, application: str = "", pin: bool = True
+) -> Iterator[EndlessRun]:
     """A run at `rate_hz` requests a second (0: a closed loop), stopped at the end of the block."""
-    launched = _start(ftm, placement, LoadRun(REQUESTS_ENDLESS, rate_hz), pin)
+    launched = _start(ftm, placement, LoadRun(REQUESTS_ENDLESS, rate_hz), pin, application)
     run = EndlessRun(launched.private)
     try:
         yield run

@@ -10,6 +10,7 @@ from typing import Annotated, Final, Literal
 import msgspec
 import typer
 
+from aftbed.bench import ballast
 from aftbed.bench.adaptation import bench_adapt
 from aftbed.bench.cycle import bench_cycle, bench_hops
 from aftbed.bench.recovery import bench_recovery
@@ -96,7 +97,17 @@ def recovery(
 @bench.command()
 def adapt(
     old: Annotated[str, typer.Option("--from", help="The first mechanism.")] = "pbr",
-    new: Annotated[str, typer.Option("--to", help="The mechanism it is adapted to.")] = "pbr+tr",
+    new: Annotated[
+        str, typer.Option("--to", help="The mechanism it is adapted to.", show_default="pbr+tr")
+    ] = "",
+    update: Annotated[
+        int,
+        typer.Option(
+            metavar="<bytes>",
+            show_default=False,
+            help="In place of --to: update a function whose state has so many bytes.",
+        ),
+    ] = 0,
     placement: Placement = "process",
     recipe: Recipe = "drained",
     adaptations: Annotated[int, typer.Option(min=1, help="There; as many lead back.")] = 55,
@@ -105,11 +116,24 @@ def adapt(
     json: Json = False,
 ) -> None:
     """Adaptations there and back under load: the blackout at the client, and what is lost."""
-    if canonical(old) == canonical(new):
+    if update and new:
+        raise ConfigError(f"--to {new} --update {update}: one of them is allowed; an update keeps --from")
+    if update:
+        check_range("--update", update, ballast.SIZE_BYTES_MIN, ballast.SIZE_BYTES_MAX)
+    new = old if update else new or "pbr+tr"
+    if not update and canonical(old) == canonical(new):
         raise ConfigError(f"--from {old} --to {new}: the same mechanism; two different ones are allowed")
     with _measuring("adapt", as_json=json) as progress:
         found = bench_adapt(
-            old, new, placement, recipe, adaptations, pin=pin, rounds=rounds, show=progress.show
+            old,
+            new,
+            placement,
+            recipe,
+            adaptations,
+            update_bytes=update,
+            pin=pin,
+            rounds=rounds,
+            show=progress.show,
         )
     _print(found, as_json=json)
 
@@ -197,11 +221,10 @@ def state(
     json: Json = False,
 ) -> None:
     """The cycle under a large state beside a small one, a page of it changed; the blackout of an update."""
-    from aftbed.bench.ballast import SIZE_BYTES_MAX, SIZE_BYTES_MIN  # noqa: PLC0415 - see above
     from aftbed.bench.sweep import bench_state  # noqa: PLC0415 - see above
 
-    check_range("--bytes", size, SIZE_BYTES_MIN, SIZE_BYTES_MAX)
-    check_range("--beside", beside, SIZE_BYTES_MIN, SIZE_BYTES_MAX)
+    check_range("--bytes", size, ballast.SIZE_BYTES_MIN, ballast.SIZE_BYTES_MAX)
+    check_range("--beside", beside, ballast.SIZE_BYTES_MIN, ballast.SIZE_BYTES_MAX)
     with _measuring("state", as_json=json) as progress:
         found = bench_state(ftm, size, beside, tracked=tells_changes, rounds=rounds, show=progress.show)
     _print(found, as_json=json)

@@ -88,6 +88,16 @@ def check_times_of_a_set(path: Path, document: dict[str, Any]) -> None:
     assert all(0 < one["blackout_ms"] < one["total_ms"] and one["of"] >= 1 for one in found.values())
 
 
+def test_an_update(home: Home) -> None:
+    found = document("adapt", "--update", "1000", "--adaptations", "1")
+    for one in (found, found["back"]):
+        check_beside(one, DEATH, 1)
+        assert list(one["steps_ms"]) == ["suspend", "drain", "migrate", "exchange", "resume"]
+        assert one["bricks_changed"] == 2  # the Servers
+    assert (found["from"], found["to"], found["update_bytes"]) == ("pbr", "pbr", 1000)
+    assert found["requests"]["lost"] == found["requests"]["wrong"] == 0
+
+
 @pytest.mark.deep
 def test_the_papers_recipe_goes_one_way(home: Home) -> None:
     found = document("adapt", "--adaptations", "2", "--recipe", "paper", "--rounds", "1")

@@ -321,6 +321,7 @@ def test_the_way_back_of_a_result_is_left_out_where_there_is_none(call: Call, tm
             json.dumps(TIMES | {"placement": "single"}),
             ("placement single", "allowed are drained and process"),
         ),
+        (json.dumps(TIMES | {"to": "pbr"}), ("an update; allowed is an adaptation to another mechanism",)),
         (
             json.dumps(TIMES | {"to": "lfr+tr"}),
             ("found pbr to lfr+tr and lfr+tr to pbr", "this set adapts", "pbr to lfr"),
