@@ -51,6 +51,7 @@ from aftbed.core.script import (
     after,
     flat,
     names,
+    verb_of,
 )
 from aftbed.ftm.compose import NONE, REPLICAS, STATEFUL, build, known_expressions, replication_of
 from aftbed.ftm.registry import KINDS
@@ -108,7 +109,7 @@ def _strangers(graph: Graph, script: Script) -> Iterator[StepRefusal]:
             for name in names(verb):
                 if name not in allowed:
                     wrong = unknown("node" if is_node else "brick", name, allowed)
-                    yield StepRefusal(place, f"{type(verb).__name__.lower()}: {wrong}")
+                    yield StepRefusal(place, f"{verb_of(verb)}: {wrong}")
 
 
 # -- by itself ------------------------------------------------------------------------------------
@@ -222,7 +223,7 @@ def _forms(graph: Graph, script: Script) -> list[str]:
     ]
     if script.recipe == RECIPES[0]:
         paper = [v for v in verbs if isinstance(v, Freeze | Thaw)]
-        found += [f"{type(v).__name__.lower()} is for recipe {RECIPES[1]} only: {v.brick}" for v in paper]
+        found += [f"{verb_of(v)} is for recipe {RECIPES[1]} only: {v.brick}" for v in paper]
     elif graph.placement != PLACEMENTS[0]:
         found.append(f"recipe {script.recipe} is for placement {PLACEMENTS[0]} only, found {graph.placement}")
     return found

@@ -41,6 +41,7 @@ from aftbed.core.script import (
     Transfer,
     Unbind,
     names,
+    verb_of,
 )
 from aftbed.ftm.compose import parse
 from aftbed.ftm.registry import KINDS
@@ -48,7 +49,7 @@ from aftbed.ftm.registry import KINDS
 ARROW: Final = "->"
 RECOVERY: Final = ("spawn", "fence", "kill", "promote", "attach")
 VERBS: Final[dict[str, type[Step]]] = {
-    step.__name__.lower(): step for step in get_args(Step) if step.__name__.lower() not in RECOVERY
+    verb_of(step): step for step in get_args(Step) if verb_of(step) not in RECOVERY
 }
 
 StepEntry = dict[str, object]  # one verb, and what it acts on
@@ -124,7 +125,7 @@ def phases(script: Script) -> dict[str, tuple[Step, ...]]:
 
 def entry(step: Step) -> StepEntry:
     """One step as a file holds it."""
-    verb = type(step).__name__.lower()
+    verb = verb_of(step)
     assert verb in VERBS, f"{verb} has no place in an adaptation"
     value: object
     match step:

@@ -49,7 +49,7 @@ from aftbed.core.graph import PLACEMENTS, Graph
 from aftbed.core.journal import EntryKind, Record
 from aftbed.core.messages import Goal
 from aftbed.core.progress import Show, unshown
-from aftbed.core.script import RECIPES, Stage, flat
+from aftbed.core.script import RECIPES, Stage, flat, verb_of
 from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import build, parse, protected_by
 from aftbed.judge import checks
@@ -216,7 +216,7 @@ def _commit_of(way: _Way) -> _Commit:
     """The steps of its commit."""
     script = plan(way.old, way.new, way.goal.recipe).script
     staged = sum(isinstance(step, Stage) for step in flat(script.prepare))
-    kinds = [dict.fromkeys(type(one).__name__.lower() for one in flat((step,))) for step in script.commit]
+    kinds = [dict.fromkeys(verb_of(one) for one in flat((step,))) for step in script.commit]
     return _Commit(staged, tuple(map("+".join, kinds)))
 
 

@@ -218,6 +218,12 @@ def flat(steps: Iterable[Step]) -> Iterator[Step]:
             yield step
 
 
+def verb_of(step: type[Step] | Step) -> str:
+    """Its word, in script files and for people."""
+    kind = step if isinstance(step, type) else type(step)
+    return kind.__name__.lower()
+
+
 def names(step: Step) -> tuple[str, ...]:
     """The replicas, nodes and bricks that `step` acts on."""
     match step:

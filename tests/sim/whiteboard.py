@@ -246,6 +246,6 @@ def spoken(verb: script.Step) -> str:
         case script.Unbind(brick, port):
             return f"unbind {port} of {brick}"
         case script.Transfer(source, sink) | script.Align(source, sink):
-            return f"{type(verb).__name__.lower()} {source} to {sink}"
+            return f"{script.verb_of(verb)} {source} to {sink}"
         case _:
-            return f"{type(verb).__name__.lower()} {' '.join(script.names(verb))}"
+            return f"{script.verb_of(verb)} {' '.join(script.names(verb))}"
