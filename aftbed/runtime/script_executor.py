@@ -397,10 +397,12 @@ class Execution:
         self.done += binds
         changes = self._rebinding.changes(binds, committing=False)
         yield from self._rebinding.send(changes, STEP_SECONDS_MAX)
-        rebinds = [step for step in self.script.commit if _rebinds(step)]
+        commit = self.script.commit
+        rebinds = [at for at, step in enumerate(commit) if _rebinds(step)]
         # The paper's recipe stages in the commit; of several, the later ones depend on the first.
         if self.script.recipe == RECIPES[0] and len(rebinds) == 1:
-            self._rebinding.prepare(tuple(flat(rebinds)))
+            (at,) = rebinds
+            self._rebinding.prepare(to_be_told(tuple(flat(commit[at : at + 1])), self.old, commit[:at]))
         yield from self._deployment.pool.wait_for_forks(LIGHT)
 
     def commit(self) -> Keys:
@@ -755,7 +757,8 @@ class Execution:
         """Each process gets all its changes at once; then the staged one takes its place."""
         if self.script.kind is not ScriptKind.ADAPTATION:
             self._note_backup(steps)
-        yield from self._rebinding.send(self._rebinding.changes(steps, committing=True), STEP_SECONDS_MAX)
+        told = to_be_told(steps, self.old, self.done)
+        yield from self._rebinding.send(self._rebinding.changes(told, committing=True), STEP_SECONDS_MAX)
         yield from self._finish_aligning()
         for step in steps:
             if isinstance(step, Exchange):
@@ -909,3 +912,19 @@ def end(process: Process) -> None:
 def _rebinds(step: Step) -> bool:
     """Whether `step` is about channels and places."""
     return all(isinstance(one, Bind | Unbind | Exchange) for one in flat((step,)))
+
+
+def to_be_told(steps: tuple[Step, ...], graph: Graph, done: Iterable[Step]) -> tuple[Step, ...]:
+    """Of `steps` that rebind `graph`, those that a process has to be told: not of an Exchange, which suspends
+    the old node, where a step of `done` has suspended it and none has resumed any since.
+    """
+    suspended: set[str] = set()  # nodes
+    for step in flat(done):
+        match step:
+            case Suspend(brick) | Drain(brick):
+                suspended |= {node for node, hosted in graph.nodes.items() if brick in hosted}
+            case Resume():
+                suspended.clear()
+            case _:
+                pass
+    return tuple(step for step in steps if not (isinstance(step, Exchange) and step.node in suspended))

@@ -70,6 +70,7 @@ def rehearse() -> None:
     _rehearse_chain()
     for _ in range(ROUNDS):
         _rehearse_mail(MAIL_ROUNDS)
+        _rehearse_commit()
         for work in _FAILOVER.values():
             work()
 
@@ -82,8 +83,11 @@ def settle() -> None:
 
 
 def rehearse_node(kinds: Iterable[str]) -> None:
-    """In the process that will be a node with bricks of these kinds: mail, and their parts of a failover."""
+    """In the process that will be a node with bricks of these kinds: mail, the orders of a commit, and their
+    parts of a failover.
+    """
     _rehearse_mail(1)
+    _rehearse_commit()
     for part in {last_word(kind) for kind in kinds} & _FAILOVER.keys():
         _FAILOVER[part]()
     gc.collect()  # nodes refer to themselves
@@ -198,6 +202,25 @@ def _rehearse_mail(rounds: int) -> None:
     scratch.close()
 
 
+def _rehearse_commit() -> None:
+    """Be drained, bound to other channels, and resumed."""
+    scratch = _Scratch(PassBefore(), ("pro2bfr",), ("bfr2prd",))
+    scratch.order(control.SuspendNode(1, drain=True))
+    scratch.io.turn()  # the nudge, and the order with it
+    (into, read), (write, _) = scratch.pair(), scratch.pair()
+    ends = control.Port("brick", "pro2bfr", 0), control.Port("brick", "bfr2prd", 1)
+    rewire = control.Rewire(2, ends[:1], ends[1:], 1, suspend=False)
+    scratch.line.send(rewire, (read.fileno(), write.fileno()))
+    scratch.io.turn()  # it is quiescent, and waits for an order
+    scratch.into["pro2bfr"] = into
+    scratch.line.send(control.ResumeNode(3))
+    scratch.io.turn()
+    for token in range(1, 4):
+        got = scratch.line.recv()
+        assert got is not None and got[0] == control.Ack(token, b"", ""), "a rehearsal went wrong"
+    scratch.close()
+
+
 def _promote() -> None:
     scratch = _Scratch(PbrAfter(1, leads=False), ("aft2aft", "srv2aft"), ("aft2srv", "aft2pro", "aft2aft"))
     scratch.order(control.Deliver(control.UNANSWERED, "brick", Promotion(2)))
@@ -242,13 +265,22 @@ def _serve() -> None:
         Server(default_application(), 2),
         (("prd2srv", Request(2, 1, payload)), ("aft2srv", CaptureState(2, 1))),
         ("srv2prd", "srv2aft"),
+        (control.Capture(1, "brick"),),
     )
 
 
-def _step(brick: Brick, mail: tuple[tuple[str, Message], ...], outputs: tuple[str, ...]) -> None:
+def _step(
+    brick: Brick,
+    mail: tuple[tuple[str, Message], ...],
+    outputs: tuple[str, ...],
+    orders: tuple[control.ToNode, ...] = (),
+) -> None:
     scratch = _Scratch(brick, tuple({port: None for port, _ in mail}), outputs)
     for port, message in mail:
         scratch.send(port, message)
+        scratch.io.turn()
+    for order in orders:
+        scratch.order(order)
         scratch.io.turn()
     scratch.close()
 
