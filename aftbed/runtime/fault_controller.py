@@ -198,8 +198,7 @@ class FaultController:
     def _withdraw(self, injection: RunInjection, host: Process) -> Keys:
         """Its host no longer emits its event, was replaced, or is dead.
 
-        One that was replaced is suspended, and serves again if the adaptation is undone: it reads this
-        before its Resume.
+        One that was replaced serves again if the adaptation is undone. It reads this before any mail.
         """
         deployment = self._deployment
         injection.move_out(self._runtime.records(host.journal))
