@@ -26,7 +26,7 @@ if os.fork():
 
 def faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    rehearsal.rehearse_node([sys.argv[1]])
+    rehearsal.rehearse_node([sys.argv[1]], commits=True)
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
 def left():

@@ -82,12 +82,13 @@ def settle() -> None:
     gc.freeze()
 
 
-def rehearse_node(kinds: Iterable[str]) -> None:
-    """In the process that will be a node with bricks of these kinds: mail, the orders of a commit, and their
-    parts of a failover.
+def rehearse_node(kinds: Iterable[str], *, commits: bool = False) -> None:
+    """In the process that will be a node with bricks of these kinds: mail, and their parts of a failover; if
+    it `commits`, the orders of a commit.
     """
     _rehearse_mail(1)
-    _rehearse_commit()
+    if commits:
+        _rehearse_commit()
     for part in {last_word(kind) for kind in kinds} & _FAILOVER.keys():
         _FAILOVER[part]()
     gc.collect()  # nodes refer to themselves

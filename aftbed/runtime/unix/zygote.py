@@ -200,7 +200,7 @@ def _make_node(line: Line[control.ToNode], order: control.Assign, fds: list[int]
     if order.staged and order.aside is not None:
         os.sched_setaffinity(0, {order.aside})  # requests are served on the other one
     if order.rehearse:
-        rehearsal.rehearse_node(brick.kind for brick in order.bricks)
+        rehearsal.rehearse_node((brick.kind for brick in order.bricks), commits=order.staged)
     if order.cpu is not None:
         os.sched_setaffinity(0, {order.cpu})
     if kind in ("watchdog", "recovery"):
