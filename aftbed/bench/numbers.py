@@ -133,7 +133,7 @@ LINES: Final = (
     *_adaptation("switch `pbr` to `lfr`", "--from pbr --to lfr", p50=1.5, p99=4.0),
     *_adaptation("update of a function with 1 kB of state", "--from pbr --update 1000", p50=1.5)[:2],
     TableLine(
-        "the same by the paper's recipe (the paper: 300 ms)", RECIPE, "blackout_ms", "ms", OWN, OWN_RATIO
+        "composition by the paper's recipe (the paper: 300 ms)", RECIPE, "blackout_ms", "ms", OWN, OWN_RATIO
     ),
     TableLine("of these, never served again", RECIPE, "stuck", counted=True),
     _state("cycle under `pbr`, 1 MB of state, a page changed", "--bytes 1000000", p50=2.0),
