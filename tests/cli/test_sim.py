@@ -293,7 +293,8 @@ def test_what_a_function_says_wrong_after_a_failover_is_found(sim: Call, tmp_pat
     assert f"--app {tmp_path}/adder.py:Adder" in again
 
 
-ROLLED_BACK: Final = ("--adapt", "to lfr at request 5", "--inject", "crash b/after at adapt.step.enter nth 7")
+NEEDED: Final = "crash b/before at adapt.step.enter nth 7"
+ROLLED_BACK: Final = ("--adapt", "to lfr at request 5", "--inject", NEEDED)
 REFUSED: Final = ("--adapt", "to pbr at request 5", "--force")
 
 
