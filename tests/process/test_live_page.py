@@ -29,6 +29,7 @@ NOBODY: Final = 65534
 SECONDS_MAX: Final = 20.0
 ENDLESS: Final = ("--load", "1000000@100")
 DRIVE: Final = ("--scenario", "free-drive", "--pace", "0.2")
+DENSE: Final = ("--scenario", "free-drive", "--duration", "90s")  # some requests wait in each hang
 
 
 @pytest.fixture
@@ -95,7 +96,7 @@ def snapshots(line: socket.socket) -> Iterator[live_page.Snapshot]:
 
 @needs_browser
 def test_it_shows_a_crash_and_a_composition_that_its_buttons_asked_for(home: Home, tmp_path: Path) -> None:
-    with Command(*DRIVE, "--web") as command:
+    with Command(*DENSE, "--web") as command:
         command.wait_until_it_drives()
         with driven(tmp_path) as page:
             page.open(address(command))
