@@ -298,8 +298,9 @@ class Fired(msgspec.Struct, frozen=True, tag=True):
     fault: int
 
 
-# Kinds of reports: of the hub about faults of the bus and conditions of the car; of the vehicle about those
-# of its radar.
+# Kinds of reports: of the Client's node about its load; of the hub about faults of the bus and conditions of
+# the car; of the vehicle about those of its radar.
+LOAD_ENDED: Final = "load.ended"  # all is asked and answered
 HUB: Final = "hub"
 BUS_FAULT_ARMED: Final = "disturbed"
 BUS_FAULTS_CHANGED: Final = "struck"  # the receipts that are new

@@ -95,15 +95,22 @@ def resume_client(client: Client, history: Iterable[Entry], state: bytes = b"") 
 
 class Load(Device):
     """Requests out of a list. `rate_hz` 0 is a closed loop: the next request follows the reply. Stops after
-    `count`.
+    `count`; `on_end` is called with the reply behind which all are answered.
     """
 
     port = "submit"
 
     def __init__(
-        self, client: Client, dialogue: Dialogue, requests: list[bytes], count: int, rate_hz: float
+        self,
+        client: Client,
+        dialogue: Dialogue,
+        requests: list[bytes],
+        count: int,
+        rate_hz: float,
+        on_end: Callable[[], None] = lambda: None,
     ) -> None:
         self._client, self._dialogue, self._requests, self._count = client, dialogue, requests, count
+        self._on_end = on_end
         self._period_ns = round(1e9 / rate_hz) if rate_hz else 0
         self._next_ns = 0
         self.polled = self._period_ns > 0
@@ -125,6 +132,8 @@ class Load(Device):
 
     def accept(self, reply: Reply, now_ns: int) -> None:
         self._dialogue.write(now_ns, reply.request_id, reply.epoch, _ANSWERED, reply.payload)
+        if self._client.next_id > self._count and self.done:
+            self._on_end()
 
     def quiet(self) -> None:
         self._count = self._client.next_id - 1

@@ -10,6 +10,7 @@ from aftbed.core.journal import EntryKind
 from aftbed.core.script import ScriptKind
 from aftbed.inject.model import parse
 from aftbed.runtime.script_executor import ScriptExecutor
+from aftbed.runtime.unix import workload
 from aftbed.runtime.unix.options import LoadRun
 from aftbed.runtime.unix.process_pool import UnixProcess
 
@@ -31,7 +32,7 @@ def test_a_follower_that_is_behind_is_waited_for(home: Home) -> None:
 
 
 def test_what_is_under_way_when_it_is_stopped_is_answered(home: Home) -> None:
-    """Each takes 80 ms here; the last look of a run that is polled every 20 ms is older than that."""
+    """Each takes 80 ms here; the last count of requests is older than that."""
     fault = parse("delay pxy2pro by 80ms permanent")
     with Started(home, LoadRun(1000, 5.2), faults=(fault,)) as run:
         run.wait_for_answers(1)
@@ -41,6 +42,13 @@ def test_what_is_under_way_when_it_is_stopped_is_answered(home: Home) -> None:
     requests = outcome.verdict.requests
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
     assert requests.sent == requests.answered > 1
+
+
+def test_a_load_has_ended_when_the_client_says_so(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workload, "LOAD_POLL_SECONDS", (3600.0, 3600.0))  # the supervisor is a fork
+    outcome = Started(home, LoadRun(COUNT, 0.0)).finish()
+    assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
+    assert outcome.verdict.requests.answered == COUNT
 
 
 @pytest.mark.parametrize("ftm", ["pbr", "lfr"])

@@ -123,8 +123,11 @@ def load_requests(seed: int, count: int, *, fixed: bool) -> list[bytes]:
     return sample_requests(seed, min(count, LOAD_REQUESTS), fixed=fixed)
 
 
-def make_source(client: Client, options: SourceOptions) -> Device:
-    """Where the requests of a Client come from; the Client takes over from its predecessors."""
+def make_source(client: Client, options: SourceOptions, on_end: Callable[[], None]) -> Device:
+    """Where the requests of a Client come from; the Client takes over from its predecessors.
+
+    `on_end`: called when all requests of a load are answered.
+    """
     journals, work = Path(options.journals), options.work
     state, since = last_words(journals, options.incarnation)
     resume_client(client, since, state)
@@ -136,7 +139,7 @@ def make_source(client: Client, options: SourceOptions) -> Device:
             given = stored_requests(journals.parent)
             assert given, f"the requests are no longer in {journals.parent}"
             requests = list(given)
-        return Load(client, dialogue, requests, work.count, work.rate_hz)
+        return Load(client, dialogue, requests, work.count, work.rate_hz, on_end)
     # Imported here: the bus costs 150 ms to import, and only the zygote of the bus has it.
     from aftbed.vehicle.can.dbc_file import own_dbc  # noqa: PLC0415
     from aftbed.vehicle.gateway import Gateway  # noqa: PLC0415

@@ -50,8 +50,9 @@ COUNTS_SECONDS: Final = 0.2  # between two reports that differ in counts alone, 
 LATE_NS_MAX: Final = 40_000_000  # of a look: beyond it the machine was too busy to judge what hangs
 DRAIN_SECONDS_MAX: Final = 2.0
 DRAIN_STARVED_SECONDS_MAX: Final = 10.0  # for which a process waited for a CPU meanwhile: not counted
-DRAIN_SECONDS: Final = 0.005  # between two checks of what is still under way
+DRAIN_SECONDS: Final = 0.001  # between two checks of what is still under way
 LOOKS_MAX: Final = 80  # at states that differ: time for a follower on a busy machine
+LOOK_AGAIN_SECONDS: Final = 0.005  # at the states
 STOP_SECONDS_MAX: Final = 1.0
 HUB_SECONDS_MAX: Final = 0.2  # for its last frames, and to tell its clients
 
@@ -349,7 +350,7 @@ class Supervisor:
     def _looked(self, began_ns: int, waited_ns: dict[int, int]) -> None:
         """A replica may have yet to apply what was sent to it: look again, for a time."""
         self._looks_left = self._looks_left - 1 if len(set(self._states.values())) > 1 else 0
-        pause_s = DRAIN_SECONDS if self._looks_left else 0.0
+        pause_s = LOOK_AGAIN_SECONDS if self._looks_left else 0.0
         self._loop.after(pause_s, lambda: self._drain(began_ns, waited_ns))
 
     @property

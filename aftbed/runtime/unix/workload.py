@@ -35,7 +35,7 @@ from aftbed.vehicle.condition import Condition
 from aftbed.vehicle.plant import Telemetry
 
 ATTACH_SECONDS_MAX: Final = 10.0
-LOAD_POLL_SECONDS: Final = (0.02, 0.5)  # between two questions how far a load has come: at least, at most
+LOAD_POLL_SECONDS: Final = (0.2, 0.5)  # between two questions how far a load has come: at least, at most
 STALL_SECONDS_MAX: Final = 3.0  # a recovery takes milliseconds, a loss is seen after half a second
 SLOWEST_SECONDS: Final = 2.0
 SLOWEST_MAX: Final = 100  # the Client is asked no more often than `LOAD_POLL_SECONDS`
@@ -258,8 +258,10 @@ class Workload:
     # -- while it runs ------------------------------------------------------------------------
 
     def on_report(self, process: UnixProcess, kind: str, data: bytes) -> None:
-        """A report of a service."""
-        if kind == "ready":
+        """A report of a service, or of the Client's node."""
+        if kind == control.LOAD_ENDED:
+            self._load_ended()
+        elif kind == "ready":
             self._ready.add(process.name)
             self._loop.tasks.settle(("ready", process.name, 0))
         elif kind in control.BUS_REPORTS:
@@ -311,7 +313,10 @@ class Workload:
         return max((us for _, us in self._slowest), default=None)
 
     def _poll_load(self) -> None:
-        """Watch the load again when it can be over; now and then, in case nothing moves any more."""
+        """Watch the load again when it can be over; now and then, in case nothing moves any more.
+
+        The Client tells when it is over; but one that dies may not have told it.
+        """
         work, sent, (pause, longest) = self._options.work, self._stats.get("sent"), LOAD_POLL_SECONDS
         if isinstance(work, LoadRun) and work.rate_hz and isinstance(sent, int):
             pause = min(longest, max(pause, (work.count - sent) / work.rate_hz))
@@ -337,6 +342,16 @@ class Workload:
                 self._finish("")
             else:
                 self._poll_load()
+
+        self._loop.tasks.start(STATS_TASK, self._ask_stats(), asked)
+
+    def _load_ended(self) -> None:
+        """The Client says so: ask for its last counts, show them, and finish."""
+
+        def asked(failure: str) -> None:
+            self._counted()
+            if self._stats.get("done"):
+                self._finish("")
 
         self._loop.tasks.start(STATS_TASK, self._ask_stats(), asked)
 

@@ -214,7 +214,7 @@ def _make_node(line: Line[control.ToNode], order: control.Assign, fds: list[int]
     if kind == "engine":
         gc.enable()  # a plan leaves cycles behind, and the Engine is not on the request path
     code = _NotedCode(order.journal)
-    Assembler(default_application, code).build(node, order, fds, lambda: _make_device(order, node))
+    Assembler(default_application, code).build(node, order, fds, lambda: _make_device(order, node, line))
     return io
 
 
@@ -255,12 +255,13 @@ class _NotedCode(Code):
         return source
 
 
-def _make_device(order: control.Assign, node: UnixNode) -> Device:
+def _make_device(order: control.Assign, node: UnixNode, line: Line[control.ToNode]) -> Device:
     if order.device == "sensor":
         return Sensor(ProcessSenses())
     client = node.brick(order.bricks[0].name)
     assert isinstance(client, Client)
-    return make_source(client, msgspec.msgpack.decode(order.options, type=SourceOptions))
+    options = msgspec.msgpack.decode(order.options, type=SourceOptions)
+    return make_source(client, options, lambda: line.send(control.Report(control.LOAD_ENDED, b"")))
 
 
 if __name__ == "__main__":
