@@ -171,11 +171,13 @@ def failed(result: Result) -> bool:
 # from sleeps of a millisecond, as a node does that waits for mail, and the supervisor of the run reports how
 # long its unluckiest node was ready to run and had no CPU. If either is far off, the experiment is marked as
 # noisy: what depends on time in it is inconclusive, what does not (a wrong reply, a lost one) stands.
+# The measurement after an experiment, if it finds the machine quiet, is the one before the next.
 
 SLEEP_SECONDS: Final = 0.001
 SLEEPS: Final = 5
 FACTOR: Final = 10.0
 LATE_MS_MIN: Final = 5.0  # a recovery takes about as long on a bad day: less is no excuse
+QUIET_SECONDS: Final = 0.02  # from a measurement; no experiment is as short
 
 
 def lateness_ms() -> float:
@@ -193,10 +195,16 @@ class Probe:
 
     def __init__(self) -> None:
         self.quiet_ms = lateness_ms()
+        self._quiet_s = -QUIET_SECONDS  # when the machine was found quiet last
 
     def noisy(self) -> bool:
-        """Whether the machine is too busy now."""
-        return lateness_ms() > max(LATE_MS_MIN, FACTOR * self.quiet_ms)
+        """Whether the machine is too busy now. It is not, for `QUIET_SECONDS` after it was found quiet."""
+        if time.monotonic() - self._quiet_s < QUIET_SECONDS:
+            return False
+        noisy = lateness_ms() > max(LATE_MS_MIN, FACTOR * self.quiet_ms)
+        if not noisy:
+            self._quiet_s = time.monotonic()
+        return noisy
 
 
 # -- one experiment -------------------------------------------------------------------------------

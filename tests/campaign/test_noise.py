@@ -1,10 +1,13 @@
 """What is said of a run on a machine that was too busy for times to mean anything."""
 
+from types import SimpleNamespace
+
 import pytest
 from campaigns import result
 from msgspec.structs import replace
 
-from aftbed.campaign.experiment import Probe, without_times
+from aftbed.campaign import experiment
+from aftbed.campaign.experiment import QUIET_SECONDS, Probe, without_times
 from aftbed.judge.intervals import STARVED_MS_MIN, starved
 
 
@@ -73,3 +76,26 @@ def test_a_fault_that_found_a_replica_given_up_by_a_false_alarm_is_inconclusive(
 
 def test_a_probe_is_calibrated_by_the_machine_it_runs_on() -> None:
     assert Probe().quiet_ms < 1000
+
+
+def test_a_machine_found_quiet_behind_an_experiment_is_not_measured_again_before_the_next(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    late_ms, now_s, taken = 0.1, 100.0, []
+
+    def lateness_ms() -> float:
+        taken.append(late_ms)
+        return late_ms
+
+    monkeypatch.setattr(experiment, "lateness_ms", lateness_ms)
+    monkeypatch.setattr(experiment, "time", SimpleNamespace(monotonic=lambda: now_s))
+    probe = Probe()
+    assert not probe.noisy()
+    late_ms, now_s = 1000.0, now_s + QUIET_SECONDS / 2
+    assert not probe.noisy()
+    assert len(taken) == 2  # the first of them when it was made
+    now_s += QUIET_SECONDS
+    assert probe.noisy()
+    late_ms = 0.1
+    assert not probe.noisy()  # one that was busy is measured again at once
+    assert len(taken) == 4
