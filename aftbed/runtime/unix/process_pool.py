@@ -24,14 +24,13 @@ from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.cleanup import UndoLedger
 from aftbed.runtime.unix.event_loop import EventLoop
 from aftbed.runtime.unix.liveness import Liveness
-from aftbed.runtime.unix.transport import Line, decode_report
+from aftbed.runtime.unix.transport import FDS_MAX, Line, decode_report
 
 REAP_SECONDS: Final = 0.01  # a failover does not wait for the reaping of a dead process
 SPARE_SECONDS_MAX: Final = 5.0  # a zygote imports first
 DEMAND: Final = 3  # spares that are forked where one is waited for: the next ones are wanted soon
 ANEW_SECONDS: Final = 0.05  # from the end of a spare before its first message to the order of another one
 EARLY_ENDS_MAX: Final = 100  # spares in a row that end so
-PARK_BATCH: Final = 8  # spares per order: the first of them start while the next are forked
 WATCHING_KINDS: Final = ("watchdog", "recovery")
 SERVER: Final = "server"  # the kind of brick that hosts the function
 CRASHES: Final = (signal.SIGSEGV, signal.SIGABRT, signal.SIGILL, signal.SIGFPE)
@@ -188,10 +187,10 @@ class UnixProcessPool:
 
     def park(self, zygote: str, count: int) -> None:
         """Have `count` more spares forked."""
-        for first in range(0, count, PARK_BATCH):
+        for first in range(0, count, FDS_MAX):
             pairs = [
                 socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-                for _ in range(min(PARK_BATCH, count - first))
+                for _ in range(min(FDS_MAX, count - first))
             ]
             self._unborn[zygote] += [self._add("spare", ProcessKind.SPARE, ours) for ours, _ in pairs]
             with contextlib.suppress(OSError):  # a dead zygote: its restart orders them again
