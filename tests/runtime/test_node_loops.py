@@ -253,6 +253,27 @@ def test_a_fault_that_is_armed_leaves_the_fast_loop_until_it_has_struck() -> Non
     assert [event for event, *_ in noted].count(Event.FAULT_APPLIED) == 1, "given twice, it began anew"
 
 
+def test_a_reader_that_ends_with_unread_mail_has_ended(tmp_path: Path) -> None:
+    """The kernel says so by another error, also behind a write that was told of the end (EPIPE)."""
+    harness, channel = Harness(tmp_path / "journal"), UnixChannel(Link("node", "out", "other", "in"))
+    harness.node.bind_output("brick", "out", os.dup(channel.write.fileno()), 1)
+    hosted, served = harness.node.bricks["brick"], []
+    channel.write.send(b"mail")
+    channel.read.close()
+
+    def serve_orders(*, wait: bool) -> None:
+        served.append(wait)
+        harness.node.bind_output("brick", "out", None, 1)
+
+    with mock.patch.object(harness.io, "serve_orders", serve_orders):
+        end = hosted.outputs["out"]
+        assert isinstance(end, int)
+        harness.io._write_hard(hosted, "out", end, b"reply")
+    assert served == [True]
+    harness.close()
+    channel.close()
+
+
 def test_a_node_whose_mail_nobody_reads_takes_itself_for_fenced(tmp_path: Path) -> None:
     """It ends, by an error that `serve` takes for a fence: what it wants to say must not be lost silently."""
     harness, channel = Harness(tmp_path / "journal"), UnixChannel(Link("node", "out", "other", "in"))

@@ -172,7 +172,7 @@ class UnixIO(NodeIO[Inlet, int]):
         """Serve until the supervisor ends it; a failed assert ends the process (fail-silence)."""
         try:
             self.loop()
-        except BrokenPipeError:
+        except ConnectionError:
             os._exit(EXIT_FENCED)
         except FunctionFailedError as error:
             self.stop_detected(self._node.name, function_failed(error))
@@ -436,7 +436,7 @@ class UnixIO(NodeIO[Inlet, int]):
             except BlockingIOError:
                 self._end_wait()
                 self.serve_orders()
-            except BrokenPipeError:
+            except ConnectionError:
                 self._end_wait()
                 self.serve_orders(wait=True)
             else:

@@ -132,7 +132,7 @@ def _joined(zygotes: dict[str, Started], options: RunOptions, output: int) -> di
     names = (LIGHT,) if load else (LIGHT, BUS)
     assert set(zygotes) <= set(names), "a zygote without a use"
     for _, sock in zygotes.values():
-        with contextlib.suppress(BrokenPipeError):  # it is dead, which the supervisor will see
+        with contextlib.suppress(ConnectionError):  # it is dead, which the supervisor will see
             Line(sock, decode_report).send(control.JoinRun(control.UNANSWERED, options.private), (output,))
     if zygotes:
         return zygotes

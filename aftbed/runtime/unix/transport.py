@@ -210,7 +210,8 @@ def put_state(descriptor: int, state: bytes) -> bytes:
 #
 # They outlive nodes: the supervisor owns both ends of each, and hands them out. `fence` shuts the writing
 # end behind all of its descriptors: what was sent stays readable, then the channel ends; a later write gets
-# EPIPE.
+# EPIPE. Where the reading end is closed with mail in it, a write gets ECONNRESET: the first one, or the
+# second, if the first gets EPIPE while the kernel is about to close the end.
 
 WRITE_PATIENCE_SECONDS: Final = ORDER_SECONDS
 assert WRITE_PATIENCE_SECONDS < WRITE_SECONDS_MAX

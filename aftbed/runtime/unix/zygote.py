@@ -66,7 +66,7 @@ def fork(name: str, cpus: list[int], *, warm: bool = False) -> tuple[int, socket
                     if name == LIGHT:
                         rehearsal.settle()
                 _serve(supervisor, rehearsed=warm or name == LIGHT)
-            except (BrokenPipeError, ConnectionResetError):  # there is no run
+            except ConnectionError:  # there is no run
                 os._exit(0)
             except BaseException:  # noqa: BLE001 - the last frame of this process
                 sys.excepthook(*sys.exc_info())
@@ -117,7 +117,7 @@ def _serve(supervisor: int, *, rehearsed: bool) -> NoReturn:
         try:
             _fork_spares(fds, supervisor)
         except OSError as error:
-            with contextlib.suppress(BrokenPipeError):  # the run has ended
+            with contextlib.suppress(ConnectionError):  # the run has ended
                 line.send(control.Report("trouble", f"no process can be forked: {error.strerror}".encode()))
             break
     os._exit(0)
@@ -154,7 +154,7 @@ def _fork_spares(fds: list[int], supervisor: int) -> None:
                 os.closerange(INHERITED_FD + 1, 1 << 16)
                 try:
                     _be_spare(supervisor)
-                except (BrokenPipeError, ConnectionResetError):  # the run has ended
+                except ConnectionError:  # the run has ended
                     os._exit(0)
         os._exit(0)
     refused = os.waitstatus_to_exitcode(os.waitpid(intermediate, 0)[1])
