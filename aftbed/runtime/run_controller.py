@@ -63,14 +63,10 @@ class RunController:
         return script + self._loop.tasks.names()
 
     def unrest(self) -> list[str]:
-        """Why the run is not at rest, as far as is known; a backup may be missing."""
-        deployment = self.deployment
+        """Why the run is not at rest, as far as is known."""
         found = [f"{name} is under way" for name in self.under_way()]
-        needed = set(deployment.graph.nodes)
-        for slot in deployment.slots.values():
-            if slot.name != deployment.leader:
-                needed -= set(slot.nodes)
-        return found + [f"{node} is missing" for node in sorted(needed) if not deployment.lives(node)]
+        missing = (node for node in sorted(self.deployment.graph.nodes) if not self.deployment.lives(node))
+        return found + [f"{node} is missing" for node in missing]
 
     def spares(self) -> int:
         """Enough for a replica and for one node beside it."""

@@ -1139,6 +1139,24 @@ MUTANTS: Final = (
         UNIT,
         ("tests/sim/test_injectors.py",),
     ),
+    SourceMutant(
+        "a reader that ended with unread mail ends the writer, too",
+        "G8",
+        f"{UNIX}/node_io.py",
+        "            except ConnectionError:\n                self._end_wait()",
+        "            except BrokenPipeError:\n                self._end_wait()",
+        UNIT,
+        ("tests/runtime/test_node_loops.py",),
+    ),
+    SourceMutant(
+        "a run ends before anything was done about the death of its backup",
+        "G8",
+        f"{RUNTIME}/run_controller.py",
+        "if not self.deployment.lives(node))",
+        "if not self.deployment.lives(node) and not node.startswith(f'{self.deployment.backup or None}/'))",
+        PROCESS,
+        ("tests/process/test_at_rest.py",),
+    ),
 )
 
 

@@ -1,7 +1,9 @@
 """A run ends at rest: all that was sent is answered, and both replicas are behind the last request."""
 
 import time
+from functools import partial
 
+import msgspec
 import pytest
 from liveruns import Home, Started, until
 
@@ -9,6 +11,9 @@ from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.core.script import ScriptKind
 from aftbed.inject.model import parse
+from aftbed.runtime import control
+from aftbed.runtime.interface import Process
+from aftbed.runtime.run_controller import RunController
 from aftbed.runtime.script_executor import ScriptExecutor
 from aftbed.runtime.unix import workload
 from aftbed.runtime.unix.options import LoadRun
@@ -17,6 +22,7 @@ from aftbed.runtime.unix.process_pool import UnixProcess
 pytestmark = pytest.mark.process
 
 COUNT = 30
+LATE_SECONDS = 0.1
 
 
 def test_a_follower_that_is_behind_is_waited_for(home: Home) -> None:
@@ -49,6 +55,28 @@ def test_a_load_has_ended_when_the_client_says_so(home: Home, monkeypatch: pytes
     outcome = Started(home, LoadRun(COUNT, 0.0)).finish()
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
     assert outcome.verdict.requests.answered == COUNT
+
+
+@pytest.mark.parametrize("crash", ["primary at reply.sent", "backup at checkpoint.applied"])
+def test_redundancy_is_back_behind_a_crash_at_the_last_request(
+    home: Home, monkeypatch: pytest.MonkeyPatch, crash: str
+) -> None:
+    """Where a machine is busy, all replies can have come long before Recovery acts on the death."""
+    on_report = RunController.on_report
+
+    def late(controller: RunController, process: Process, report: msgspec.Struct) -> None:
+        call = partial(on_report, controller, process, report)
+        if isinstance(report, control.Ordered):
+            controller.deployment.runtime.loop.after(LATE_SECONDS, call)
+        else:
+            call()
+
+    monkeypatch.setattr(RunController, "on_report", late)  # the supervisor is a fork of this process
+    fault = parse(f"crash {crash} nth {COUNT}")
+    outcome = Started(home, LoadRun(COUNT, 0.0), faults=(fault,)).finish()
+    assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
+    assert outcome.record.end is not None and outcome.record.end.backup
+    assert outcome.told("script.done")[-1].startswith("new backup")
 
 
 @pytest.mark.parametrize("ftm", ["pbr", "lfr"])
