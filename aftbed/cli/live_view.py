@@ -30,7 +30,7 @@ from typing import Final
 import msgspec
 
 from aftbed.cli.colour import Style
-from aftbed.cli.screen import IDLE_S, PERIOD_S, Key, Line, Screen, StyledText
+from aftbed.cli.screen import IDLE_S, PERIOD_S, Key, Line, Screen, StyledText, cells
 from aftbed.cli.views import KMH_PER_MS, STAGES, RunView, bus_line, requests_line
 from aftbed.core.errors import shown
 from aftbed.report.steering import ANSWER_CHARACTERS_MAX, COMMAND_S_MAX, start_command
@@ -260,17 +260,16 @@ class Prompt:
 
     def line(self, columns: int) -> Line:
         """With the cursor, which is always in sight."""
-        room = max(1, columns - len(self.command) - 4)
-        begin = max(0, self._at - room + 1)
-        before, under, behind = (
-            self.text[begin : self._at],
-            self.text[self._at : self._at + 1],
-            self.text[self._at + 1 :],
-        )
+        text, at, room = self.text, self._at, max(1, columns - len(self.command) - 4)
+        before, under, behind = text[max(0, at - room + 1) : at], text[at : at + 1] or " ", text[at + 1 :]
+        if not cells(under):
+            under = f" {under}"
+        while before and cells(before) + cells(under) > room:
+            before = before[1:]
         return (
             StyledText(f"{self.command}> ", Style.NOTE),
             StyledText(before),
-            StyledText(under or " ", Style.TITLE),
+            StyledText(under, Style.TITLE),
             StyledText(behind[: max(0, room - len(before))]),
             StyledText(""),
         )

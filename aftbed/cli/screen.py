@@ -26,7 +26,7 @@ from enum import Enum
 from types import FrameType, TracebackType
 from typing import Any, Final, NamedTuple, Self
 
-from rich.cells import set_cell_size
+from rich.cells import cell_len, set_cell_size
 
 from aftbed.cli.colour import Style, has_colour, is_capable
 from aftbed.core.errors import shown
@@ -84,17 +84,16 @@ def fitted(line: Line, width: int) -> Line:
     spans, left = list[StyledText](), width
     for text, style in line:
         clean = shown(text).replace("\n", " ")
-        cells = min(left, len(clean) if clean.isascii() else _cells(clean))
-        spans.append(StyledText(set_cell_size(clean, cells), style))
-        left -= cells
+        taken = min(left, cells(clean))
+        spans.append(StyledText(set_cell_size(clean, taken), style))
+        left -= taken
     filler = line[-1].style if line and line[-1].style is Style.TITLE else Style.PLAIN
     return (*spans, StyledText(" " * left, filler))
 
 
-def _cells(text: str) -> int:
-    from rich.cells import cell_len  # noqa: PLC0415 - of few texts
-
-    return cell_len(text)
+def cells(text: str) -> int:
+    """How many cells of a terminal `text` takes: none for a mark that is put on the character before it."""
+    return len(text) if text.isascii() else cell_len(text)
 
 
 def opened() -> "Screen | None":

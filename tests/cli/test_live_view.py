@@ -10,7 +10,7 @@ from typing import Final, cast
 
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from terminal import Terminal
 
@@ -369,6 +369,8 @@ def test_a_line_is_edited_with_the_keys_of_a_shell(typed: str, text: str) -> Non
 
 
 @given(st.binary(max_size=60), st.integers(1, 100))
+@example("\u0610\x01".encode(), 9)  # a mark that takes no cell, under the cursor
+@example("\u4f60".encode() * 10, 20)  # characters of two cells
 def test_no_key_is_an_error(typed: bytes, columns: int) -> None:
     prompt = Prompt("adapt", ["to pbr"])
     for key in keys_in(typed.decode(errors="replace")):
