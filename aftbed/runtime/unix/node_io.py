@@ -204,14 +204,18 @@ class UnixIO(NodeIO[Inlet, int]):
         """The same as `turn`, with all at hand, for a node that polls nothing.
 
         Returns for whatever is neither mail on the one open inlet nor mail between its bricks: `turn` handles
-        it.
+        it. What suspends the node, arms a fault or binds a port is an order, so that is asked for only at the
+        start, and behind orders that were served.
         """
-        node, agent, device, mail = self._node, self._node.agent, self._node.device, self._node.mail
+        node, device, mail = self._node, self._node.device, self._node.mail
+        if node.suspend_token or node.suspended or node.agent.active:
+            return
         inlets, fronts, journal = self._inlets, self._fronts, self.journal
         open_ports = fronts[0].brick.open_ports if len(fronts) == 1 else partial(_open_ports, fronts)
         mapping = journal.mapping
         activity, buffer, views = mapping[ACTIVITY_OFFSET], _BUFFER, _VIEWS
-        while not (node.suspend_token or node.suspended or agent.active) and self._fronts is fronts:
+        obeyed = False
+        while not obeyed:
             at = journal.at
             try:
                 if mail:
@@ -255,7 +259,7 @@ class UnixIO(NodeIO[Inlet, int]):
                     except OSError:
                         journal.at = at  # orders that are served meanwhile may write records
                         self._write_hard(hosted, effect.port, out, data)
-                        at = journal.at
+                        at, obeyed = journal.at, True
                 elif type(effect) is Note:
                     _pack(
                         mapping, at, now_ns, effect.request_id, effect.detail, hosted.index, effect.event.code
