@@ -41,9 +41,10 @@ from aftbed.bench.runs import (
 )
 from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import HarnessError
+from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.core.progress import Show, unshown
-from aftbed.judge.record import read_record
+from aftbed.judge.record import RunRecord, read_record
 from aftbed.runtime.unix import control_client, linux
 from aftbed.runtime.unix.control_client import ProcessRow, measured
 from aftbed.runtime.unix.interrupts import scratch_directory
@@ -180,7 +181,9 @@ def under_load(ftm: str, placement: str, rate_hz: float, seconds: float) -> Load
         found, began_ns, ended_ns = _usage(run.private, max(seconds, WINDOW_PERIODS_MIN / rate_hz))
     latency_us = latencies_us(run.record, began_ns=began_ns, ended_ns=ended_ns)
     if not latency_us:
-        raise HarnessError(f"{ftm} ({placement}) answered nothing in {found.seconds} s at {rate_hz:g} Hz")
+        raise HarnessError(
+            f"{ftm} ({placement}) at {rate_hz:g} Hz: {_silence(run.record, began_ns, ended_ns)}"
+        )
     return LoadResult(
         ftm,
         placement,
@@ -190,6 +193,19 @@ def under_load(ftm: str, placement: str, rate_hz: float, seconds: float) -> Load
         percentiles([us / 1e3 for us in latency_us]),
         bare_us,
         found,
+    )
+
+
+def _silence(record: RunRecord, began_ns: int, ended_ns: int) -> str:
+    """Why a load has no latency to show: what it sent, and how long a node had no CPU."""
+    sent_ns = [event.t_ns for event in record.history.events(Event.REQUEST_SENT)]
+    within = sum(began_ns <= t_ns < ended_ns for t_ns in sent_ns)
+    waited = f", and a node waited {record.end.starved_ms:g} ms for a CPU" if record.end is not None else ""
+    seconds = (ended_ns - began_ns) / 1e9
+    return (
+        f"in {seconds:.3f} s {within} of its {len(sent_ns)} requests were sent, and none of these was"
+        f" answered{'; the service was lost' if record.lost else ''}{waited}; measure again, with less"
+        " beside it"
     )
 
 

@@ -3,6 +3,7 @@
 No test depends on speed: it must hold on a busy machine.
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -12,8 +13,11 @@ from liveruns import Home, forked
 
 from aftbed.bench import resources, sweep
 from aftbed.bench.paper import CYCLES, QUICK, Paper, tables
+from aftbed.bench.runs import tried
+from aftbed.core.errors import HarnessError
 from aftbed.core.graph import PLACEMENTS
 
+HOUR_NS: Final = 3_600_000_000_000
 QUICK_SECONDS_MAX: Final = 240.0  # of half a minute on a machine with nothing else to do
 TAKEN: Final = {  # names of figures: what the paper has, and what stands beside it
     "initialisation.graph",
@@ -64,10 +68,29 @@ def test_it_measures_every_figure_and_writes_the_page(home: Home, tmp_path: Path
 
 def test_a_load_is_measured_in_its_window(home: Home) -> None:
     """A machine that lags sends fewer requests than was asked for, and `sent_hz` says so."""
-    found = resources.under_load("pbr", "replica", 100.0, 0.5)
+    measure = partial(resources.under_load, "pbr", "replica", 100.0, 0.5)
+    found = tried("a load", measure, print)  # as the bench does
     assert 0 < found.requests <= 100 and found.usage.processes == 9
     assert found.sent_hz == pytest.approx(found.requests / found.usage.seconds, abs=0.1)
     assert found.usage.seconds >= 0.5 and 0 < found.usage.cpu_percent < 200
+
+
+def test_a_load_without_an_answer_in_its_window_says_what_was_sent(
+    home: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = resources._usage
+
+    def later(private: Path, seconds: float) -> tuple[resources.Usage, int, int]:
+        found, began_ns, ended_ns = usage(private, seconds)
+        return found, began_ns + HOUR_NS, ended_ns + HOUR_NS
+
+    monkeypatch.setattr(resources, "_usage", later)
+    said = (
+        r"pbr \(replica\) at 100 Hz: in 0\.\d+ s 0 of its [1-9]\d* requests were sent, and none of these was"
+        r" answered, and a node waited [\d.]+ ms for a CPU; measure again"
+    )
+    with pytest.raises(HarnessError, match=said):
+        resources.under_load("pbr", "replica", 100.0, 0.1)
 
 
 def test_a_state_of_megabytes_is_carried_where_it_stays_in_its_replica(home: Home) -> None:
