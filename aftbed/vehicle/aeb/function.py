@@ -258,6 +258,7 @@ STATE_BYTES: Final = _HEADER.size + _TRACK.size * SLOTS
 _OFFSETS: Final = tuple(range(_HEADER.size, STATE_BYTES, _TRACK.size))  # by slot
 _EMPTY: Final = bytes(STATE_BYTES)
 _FREE: Final = bytes(_TRACK.size)
+_ALL_FREE: Final = tuple(bytes(STATE_BYTES - offset) for offset in _OFFSETS)  # from that slot on
 
 
 class AebFunction:
@@ -339,6 +340,8 @@ class AebFunction:
             raise PeerError(f"state with ego speed {ego_ms} m/s, time {t_ms} ms, timers {timers} ms")
         tracks: dict[int, Track] = {}
         for slot, offset in enumerate(_OFFSETS):
+            if state.endswith(_ALL_FREE[slot]):
+                break
             if state[offset : offset + _TRACK.size] != _FREE:  # to the bit, or the next capture would differ
                 track = tracks[slot] = Track(*_TRACK.unpack_from(state, offset))
                 if not track.plausible():
