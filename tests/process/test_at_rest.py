@@ -57,8 +57,15 @@ def test_a_load_has_ended_when_the_client_says_so(home: Home, monkeypatch: pytes
     assert outcome.verdict.requests.answered == COUNT
 
 
-@pytest.mark.parametrize("crash", ["primary at reply.sent", "backup at checkpoint.applied"])
-def test_redundancy_is_back_behind_a_crash_at_the_last_request(
+@pytest.mark.parametrize(
+    "crash",
+    [
+        f"primary at reply.sent nth {COUNT}",
+        # Not the last checkpoint, which is applied when all has ended as far as is known.
+        f"backup at checkpoint.applied nth {COUNT - 1}",
+    ],
+)
+def test_redundancy_is_back_behind_a_crash_at_the_end(
     home: Home, monkeypatch: pytest.MonkeyPatch, crash: str
 ) -> None:
     """Where a machine is busy, all replies can have come long before Recovery acts on the death."""
@@ -72,8 +79,7 @@ def test_redundancy_is_back_behind_a_crash_at_the_last_request(
             call()
 
     monkeypatch.setattr(RunController, "on_report", late)  # the supervisor is a fork of this process
-    fault = parse(f"crash {crash} nth {COUNT}")
-    outcome = Started(home, LoadRun(COUNT, 0.0), faults=(fault,)).finish()
+    outcome = Started(home, LoadRun(COUNT, 0.0), faults=(parse(f"crash {crash}"),)).finish()
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
     assert outcome.record.end is not None and outcome.record.end.backup
     assert outcome.told("script.done")[-1].startswith("new backup")
