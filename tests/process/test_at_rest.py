@@ -22,7 +22,7 @@ from aftbed.runtime.unix.process_pool import UnixProcess
 pytestmark = pytest.mark.process
 
 COUNT = 30
-LATE_SECONDS = 0.1
+LATE_SECONDS = 1.0  # longer than the states of the replicas are looked at
 
 
 def test_a_follower_that_is_behind_is_waited_for(home: Home) -> None:
