@@ -1149,6 +1149,15 @@ MUTANTS: Final = (
         ("tests/runtime/test_node_loops.py",),
     ),
     SourceMutant(
+        "the fast loop takes mail behind an order to suspend that came within a write",
+        "G6",
+        f"{UNIX}/node_io.py",
+        "at, obeyed = journal.at, True",
+        "at, obeyed = journal.at, False",
+        UNIT,
+        ("tests/runtime/test_node_loops.py",),
+    ),
+    SourceMutant(
         "a run ends before anything was done about the death of its backup",
         "G8",
         f"{RUNTIME}/run_controller.py",

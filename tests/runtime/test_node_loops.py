@@ -135,7 +135,7 @@ class Harness:
     def __init__(self, path: Path) -> None:
         self._path = path
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._line = Line(ours, decode_report)
+        self.line = Line(ours, decode_report)
         self._journal = JournalFile(path, "node")
         self.io = UnixIO(Line(theirs, decode_order), self._journal)
         self.node: UnixNode = Node("node", self.io)
@@ -165,7 +165,7 @@ class Harness:
 
     def _order(self, name: str) -> None:
         for order in ORDERS[name]:
-            self._line.send(order)
+            self.line.send(order)
         self._journal.mapping[FLAG_OFFSET] = 1
 
     def run(self, mail: list[bytes], loop: Loop) -> tuple[object, ...]:
@@ -191,7 +191,7 @@ class Harness:
         found = []
         while True:
             try:
-                got = self._line.recv()
+                got = self.line.recv()
             except BlockingIOError:
                 return found
             assert got is not None
@@ -251,6 +251,31 @@ def test_a_fault_that_is_armed_leaves_the_fast_loop_until_it_has_struck() -> Non
     replies = [messages.decode(packet) for packet in sent]
     assert [r.payload for r in replies if isinstance(r, Reply)][:2] == [b"`b", b"ab"]
     assert [event for event, *_ in noted].count(Event.FAULT_APPLIED) == 1, "given twice, it began anew"
+
+
+@pytest.mark.parametrize("loop", [UnixIO.loop, UnixIO.turn])
+def test_a_node_that_is_suspended_while_it_waits_for_room_takes_no_mail(loop: Loop, tmp_path: Path) -> None:
+    """The order comes by the control line alone, within a write; the fast loop would read on behind it."""
+    harness, channel = Harness(tmp_path / "journal"), UnixChannel(Link("node", "out", "other", "in"))
+    harness.node.bind_output("brick", "out", os.dup(channel.write.fileno()), 1)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            channel.write.send(NUDGE, socket.MSG_DONTWAIT)
+    serve_orders = harness.io.serve_orders
+
+    def order_comes(*, wait: bool = False) -> None:
+        if wait:
+            raise Done  # it is suspended, and waits for an order
+        harness.line.send(control.SuspendNode(2))
+        serve_orders()
+        assert channel.read.recv(messages.PACKET_BYTES_MAX) == NUDGE  # there is room again
+
+    with mock.patch.object(harness.io, "serve_orders", order_comes):
+        *_, reported, seen = harness.run([packet("nothing"), packet("answer"), packet("note")], loop)
+    assert harness.node.suspended and reported == [control.Ack(2)]
+    assert seen == ["in nothing", "other nothing", "in answer"]
+    harness.close()
+    channel.close()
 
 
 def test_a_reader_that_ends_with_unread_mail_has_ended(tmp_path: Path) -> None:
