@@ -34,7 +34,7 @@ from aftbed.inject.model import Fault, FaultReport, parse
 from aftbed.judge.asked import WITHOUT_END
 from aftbed.judge.checks import Evidence, Requests
 from aftbed.judge.handling_bound import STALL_NS
-from aftbed.judge.intervals import FTTI, HandlingIntervals, false_alarm, starved
+from aftbed.judge.intervals import FTTI, HandlingIntervals, false_alarm, starved, struck_alone
 from aftbed.judge.outcome import FAILED, OUTCOMES, UNKNOWN, outcome_of, worst
 from aftbed.judge.record import RunEnd, RunRecord, read_record
 from aftbed.judge.verdict import Verdict, evidence_of, judge
@@ -216,10 +216,7 @@ class Probe:
 REASONS_MAX: Final = 3
 REASON_MAX: Final = 300  # characters
 TIMED: Final = ("degraded", "hang")  # classes that a slow machine alone can bring about
-ALONE: Final = (
-    "omission",
-    "unavailable",
-)  # or, if it had a good replica taken for hung, with a fault behind it
+ALONE: Final = ("omission", "unavailable")  # or with a fault that struck the only replica because of it
 ON_ACTIVATION: Final = {"faults_applied", "adaptations_done", FTTI}  # the result says these in other ways
 # A service that is gone has not sent all of its load, nor made a backup; and that is one way to be degraded.
 SAID_BY_OUTCOME: Final = {
@@ -334,11 +331,12 @@ def _real(experiment: Experiment, standing: ExitStack, records: Path | None) -> 
     outcome, reasons = known_outcome(outcome, reasons, verdict)
     result = _result(experiment, evidence, verdict, outcome, reasons)
     end = evidence.record.end or RunEnd()
-    alarmed = end.starved_ms > STALL_MS and false_alarm(evidence)
+    alone = false_alarm(evidence) or (result.unexpected and struck_alone(evidence))
+    alone = alone and end.starved_ms > STALL_MS
     noisy = noisy or starved(end.starved_ms, end.seconds or 0.0) or _excused(result, end.starved_ms)
-    noisy = noisy or alarmed or _probe().noisy()
+    noisy = noisy or alone or _probe().noisy()
     result = msgspec.structs.replace(result, starved_ms=end.starved_ms)
-    result = without_times(result, alarmed=alarmed) if noisy else result
+    result = without_times(result, alone=alone) if noisy else result
     if records is not None and (result.broken or result.unexpected):
         with suppress(OSError):  # of a full disk: the result stands without it
             if not records.is_dir() or sum(1 for _ in records.iterdir()) < RECORDS_MAX:
@@ -398,13 +396,15 @@ def _probe() -> Probe:
     return Probe()
 
 
-def without_times(result: Result, *, alarmed: bool = False) -> Result:
-    """What is known of a run on a busy machine; `alarmed`: it had a good replica taken for hung."""
+def without_times(result: Result, *, alone: bool = False) -> Result:
+    """What is known of a run on a busy machine. `alone`: a fault may have struck the only replica because of
+    it, as a good one had been taken for hung, or a new backup was not there yet.
+    """
     reasons = ("the machine was too busy for times to mean anything", *result.reasons)
     timed_stop = result.outcome == "detected_stop" and detects(result.experiment.ftm, "flow")
-    by_alarm = result.unexpected and (result.outcome == "tolerated" or timed_stop)
-    by_alarm = by_alarm or (alarmed and result.outcome in ALONE)
-    outcome = "inconclusive" if result.outcome in TIMED or by_alarm else result.outcome
+    by_machine = result.unexpected and (result.outcome == "tolerated" or timed_stop)
+    by_machine = by_machine or (alone and result.outcome in ALONE)
+    outcome = "inconclusive" if result.outcome in TIMED or by_machine else result.outcome
     untimed = {"fdti_ms": None, "frti_ms": None, "fhti_ms": None}
     return msgspec.structs.replace(
         result,

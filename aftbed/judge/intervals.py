@@ -154,6 +154,17 @@ def false_alarm(evidence: Evidence) -> bool:
     return first_ns is not None and first_ns < min(strikes, default=first_ns + 1)
 
 
+def struck_alone(evidence: Evidence) -> bool:
+    """Whether a fault struck while a new backup was awaited, behind the loss of a replica."""
+    history = evidence.record.history
+    turns = history.events(Event.RECOVERY_ENTER, Event.BACKUP_READY)
+    for strike in history.events(Event.FAULT_APPLIED):
+        before = [turn for turn in turns if turn.t_ns < strike.t_ns]
+        if before and max(before, key=lambda turn: turn.t_ns).event is Event.RECOVERY_ENTER:
+            return True
+    return False
+
+
 def intervals(evidence: Evidence) -> list[HandlingIntervals]:
     """Of each fault that struck, in the order of their numbers, then of each adaptation."""
     record = evidence.record

@@ -116,6 +116,7 @@ class Adaptations:
         self._current: _Current | None = None
         self._count = 0
         self.history: list[Outcome] = []
+        self._delayed = 0  # requests for adaptations that wait for redundancy, and are asked again
         self._scheduled = 0  # how many
         self._waiting: list[tuple[int, _Request]] = []  # of those, with the requests that they wait for
 
@@ -123,6 +124,11 @@ class Adaptations:
     def busy(self) -> bool:
         """Whether an adaptation is under way."""
         return self._current is not None
+
+    @property
+    def delayed(self) -> bool:
+        """Whether an adaptation was requested that waits for redundancy, and has not begun."""
+        return self._delayed > 0
 
     @property
     def awaited(self) -> tuple[int, ...]:
@@ -176,7 +182,8 @@ class Adaptations:
                     f" backup {deployment.backup or 'none'}, engine"
                     f" {'there' if deployment.lives(ENGINE) else 'not there'}"
                 )
-            self._loop.after(RETRY_SECONDS, lambda: self._ask_again(request, retries - 1))
+            self._delayed += 1
+            self._loop.after(RETRY_SECONDS, lambda: self._ask_delayed(request, retries - 1))
             return
         plan = plan_goal(deployment.graph, request.goal)
         outcome = self._asked(request)
@@ -228,6 +235,10 @@ class Adaptations:
         release = messages.Release(request_id)
         with contextlib.suppress(StepFailed):  # the Client is dead; its successor sends the request again
             self._deployment.order(CLIENT, lambda token: control.Deliver(token, CLIENT, release))
+
+    def _ask_delayed(self, request: _Request, retries: int) -> None:
+        self._delayed -= 1
+        self._ask_again(request, retries)
 
     def _ask_again(self, request: _Request, retries: int) -> None:
         try:

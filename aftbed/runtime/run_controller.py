@@ -58,9 +58,10 @@ class RunController:
         self.scripts: list[ScriptRun] = []  # of Recovery
 
     def under_way(self) -> list[str]:
-        """What has begun and not ended. An adaptation that is observed has no task meanwhile."""
+        """What was asked for and has not ended. An adaptation that is observed has no task meanwhile."""
         script = ["a script"] if self.executor.busy or self.adaptations.busy else []
-        return script + self._loop.tasks.names()
+        delayed = ["an adaptation that waits for redundancy"] if self.adaptations.delayed else []
+        return script + delayed + self._loop.tasks.names()
 
     def unrest(self) -> list[str]:
         """Why the run is not at rest, as far as is known."""

@@ -67,10 +67,10 @@ def test_supervision_may_take_a_busy_machine_for_a_slow_replica(
     ("outcome", "after"),
     [("unavailable", "inconclusive"), ("omission", "inconclusive"), ("sdc", "sdc"), ("masked", "masked")],
 )
-def test_a_fault_that_found_a_replica_given_up_by_a_false_alarm_is_inconclusive(
+def test_a_fault_that_found_one_replica_because_of_a_busy_machine_is_inconclusive(
     outcome: str, after: str
 ) -> None:
-    found = without_times(result(outcome, unexpected=outcome != "masked"), alarmed=True)
+    found = without_times(result(outcome, unexpected=outcome != "masked"), alone=True)
     assert (found.outcome, found.unexpected) == (after, outcome == after == "sdc")
 
 

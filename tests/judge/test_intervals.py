@@ -18,6 +18,7 @@ from aftbed.judge.intervals import (
     check_ftti,
     false_alarm,
     intervals,
+    struck_alone,
 )
 from aftbed.judge.record import RunEnd, RunRecord
 from aftbed.judge.reference import reference_run
@@ -108,6 +109,14 @@ def test_a_stop_at_a_deadline_before_anything_struck_is_one_also_in_a_run_that_w
     assert false_alarm(found) == alarmed
     late = struck(Tale().served(1).sent(2)).note("a/sup.after.1", Event.DETECTED_STOP, 2, detail)
     assert not false_alarm(evidence(late, CRASH))
+
+
+def test_a_fault_behind_a_failover_strikes_the_only_replica_until_a_backup_is_ready() -> None:
+    lost = a_crash().note("recovery.1", Event.RECOVERY_ENTER).note("recovery.1", Event.RECOVERY_EXIT)
+    assert not struck_alone(evidence(lost, CRASH))
+    assert struck_alone(evidence(struck(lost, "b/server.1"), CRASH, CRASH))
+    again = a_crash().note("recovery.1", Event.RECOVERY_ENTER).note("recovery.1", Event.BACKUP_READY)
+    assert not struck_alone(evidence(struck(again, "b/server.1"), CRASH, CRASH))
 
 
 def test_the_supervisor_detects_the_death_of_a_node_of_no_replica() -> None:

@@ -40,6 +40,7 @@ from homes import (
 from aftbed.cli import main
 from aftbed.core.errors import ConfigError
 from aftbed.core.journal import EntryKind, entries
+from aftbed.core.messages import Scheduled
 from aftbed.inject.model import Fault
 from aftbed.judge.record import RunRecord, read_record
 from aftbed.judge.verdict import Verdict, judge
@@ -128,6 +129,7 @@ class Started:
         ftm: str = "pbr",
         placement: str = "process",
         faults: tuple[Fault, ...] = (),
+        adaptations: tuple[Scheduled, ...] = (),
         seed: int = 0,
         record: Path | None = None,
         bus_open: bool = False,
@@ -138,6 +140,7 @@ class Started:
             work=work,
             seed=seed,
             faults=faults,
+            adaptations=adaptations,
             record=str(record) if record else None,
             bus_open=bus_open,
         )

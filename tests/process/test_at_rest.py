@@ -1,6 +1,7 @@
 """A run ends at rest: all that was sent is answered, and both replicas are behind the last request."""
 
 import time
+from collections.abc import Container
 from functools import partial
 
 import msgspec
@@ -9,9 +10,11 @@ from liveruns import Home, Started, until
 
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
-from aftbed.core.script import ScriptKind
+from aftbed.core.messages import Goal, Scheduled
+from aftbed.core.script import LOSSES, ScriptKind
 from aftbed.inject.model import parse
-from aftbed.runtime import control
+from aftbed.runtime import adaptations, control
+from aftbed.runtime.adaptations import Adaptations
 from aftbed.runtime.interface import Process
 from aftbed.runtime.run_controller import RunController
 from aftbed.runtime.script_executor import ScriptExecutor
@@ -23,6 +26,21 @@ pytestmark = pytest.mark.process
 
 COUNT = 30
 LATE_SECONDS = 1.0  # longer than the states of the replicas are looked at
+NEW_BACKUP_SECONDS = 0.25  # until it is begun
+
+
+def delay_orders(monkeypatch: pytest.MonkeyPatch, kinds: Container[ScriptKind], seconds: float) -> None:
+    """Have the supervisors of this test, which are forks of this process, read scripts of `kinds` late."""
+    on_report = RunController.on_report
+
+    def late(controller: RunController, process: Process, report: msgspec.Struct) -> None:
+        call = partial(on_report, controller, process, report)
+        if isinstance(report, control.Ordered) and report.script.kind in kinds:
+            controller.deployment.runtime.loop.after(seconds, call)
+        else:
+            call()
+
+    monkeypatch.setattr(RunController, "on_report", late)
 
 
 def test_a_follower_that_is_behind_is_waited_for(home: Home) -> None:
@@ -69,20 +87,33 @@ def test_redundancy_is_back_behind_a_crash_at_the_end(
     home: Home, monkeypatch: pytest.MonkeyPatch, crash: str
 ) -> None:
     """Where a machine is busy, all replies can have come long before Recovery acts on the death."""
-    on_report = RunController.on_report
-
-    def late(controller: RunController, process: Process, report: msgspec.Struct) -> None:
-        call = partial(on_report, controller, process, report)
-        if isinstance(report, control.Ordered):
-            controller.deployment.runtime.loop.after(LATE_SECONDS, call)
-        else:
-            call()
-
-    monkeypatch.setattr(RunController, "on_report", late)  # the supervisor is a fork of this process
+    delay_orders(monkeypatch, LOSSES, LATE_SECONDS)
     outcome = Started(home, LoadRun(COUNT, 0.0), faults=(parse(f"crash {crash}"),)).finish()
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
     assert outcome.record.end is not None and outcome.record.end.backup
     assert outcome.told("script.done")[-1].startswith("new backup")
+
+
+def test_an_adaptation_that_waits_for_redundancy_is_done_before_the_end(
+    home: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is asked for when the backup is lost, and again when the new one is there and all is answered."""
+    request_held = Adaptations.request_held
+
+    def held_without_backup(asked: Adaptations, request_id: int) -> None:
+        held = held_without_backup if asked._deployment.backup else request_held
+        asked._loop.after(0.001, partial(held, asked, request_id))
+
+    monkeypatch.setattr(Adaptations, "request_held", held_without_backup)
+    monkeypatch.setattr(adaptations, "RETRY_SECONDS", 2 * NEW_BACKUP_SECONDS)
+    delay_orders(monkeypatch, {ScriptKind.NEW_BACKUP}, NEW_BACKUP_SECONDS)
+    fault = parse(f"crash backup at checkpoint.applied nth {COUNT - 2}")
+    change = Scheduled(Goal(expression="lfr"), at_request=COUNT)
+    outcome = Started(home, LoadRun(COUNT, 0.0), faults=(fault,), adaptations=(change,)).finish()
+    assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
+    assert [one.outcome for one in outcome.record.adaptations] == ["done"]
+    assert outcome.record.end is not None
+    assert outcome.record.end.hosted is not None and outcome.record.end.hosted.ftm == "lfr"
 
 
 @pytest.mark.parametrize("ftm", ["pbr", "lfr"])
