@@ -194,11 +194,18 @@ class RunController:
             self._loop.after(LOSS_SECONDS, self._look_for_loss)
 
     def look_for_hangs(self) -> None:
-        """Look at all nodes. One that hangs, and that no Watchdog watches, is killed, and so replaced."""
-        now_ns = self._loop.now_ns()
-        nodes = [process for process in self._runtime.pool.processes if process.kind is ProcessKind.NODE]
+        """Look at the nodes that no Watchdog watches: one that hangs is killed, and so replaced.
+
+        While an adaptation is under way, look at all, since its undo leaves out a replica that hangs.
+        """
+        now_ns, singles, adapting = self._loop.now_ns(), self.deployment.singles, self.adaptations.busy
+        nodes = [
+            process
+            for process in self._runtime.pool.processes
+            if process.kind is ProcessKind.NODE and (adapting or process.name in singles)
+        ]
         for process in [process for process in nodes if process.hangs(now_ns, HANG_NS)]:
-            if process.name in self.deployment.singles:
+            if process.name in singles:
                 self._runtime.log("hangs", f"{process.name} (pid {process.pid}): killed, to be replaced")
                 process.kill()
 

@@ -185,6 +185,16 @@ def test_a_stopped_node_is_seen_alive_when_it_goes_on(tmp_path: Path) -> None:
         wait_for(lambda: all(looks(node)))
 
 
+def test_a_node_that_is_stopped_before_the_first_look_is_not_alive_from_there_on(tmp_path: Path) -> None:
+    with node_process(tmp_path) as node:
+        node.asleep()
+        os.kill(node.pid, signal.SIGSTOP)
+        wait_for(lambda: state_of(node.pid) == "T")
+        now_ns = time.monotonic_ns()
+        assert node.liveness.seen_ns(now_ns) == now_ns - LOOK_NS, "it was alive when it was made"
+        assert node.liveness.seen_ns(now_ns + LOOK_NS) == now_ns - LOOK_NS
+
+
 def test_a_stop_is_noticed_by_the_next_look_whatever_the_node_did_before(tmp_path: Path) -> None:
     with node_process(tmp_path) as node:
         node.ask(PASS)

@@ -10,6 +10,7 @@ from typing import Final
 
 import pytest
 
+from aftbed.core.messages import Goal
 from aftbed.ftm.compose import build
 from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Trigger
@@ -43,6 +44,25 @@ def test_a_start_waits_for_a_watchdog_that_gets_no_cpu(monkeypatch: pytest.Monke
     world = World(Setup("pbr"))
     run = world.run()
     assert world.loop.ns > 5_000_000_000 and not breaches(run)
+
+
+def test_nodes_of_replicas_are_looked_at_while_an_adaptation_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their Watchdogs look at them at any time, and a look costs CPU; an undo asks which of them hang."""
+    looked: list[tuple[bool, str]] = []
+    hangs = SimProcess.hangs
+
+    def hangs_and_tells(process: SimProcess, now_ns: int, deadline_ns: int) -> bool:
+        looked.append((world.controller.adaptations.busy, process.name))
+        return hangs(process, now_ns, deadline_ns)
+
+    monkeypatch.setattr(SimProcess, "hangs", hangs_and_tells)
+    world = World(Setup("pbr", "process", 0, 60, 500.0))
+    world.start()
+    world.advance(world.loop.ns + 50_000_000)
+    world.adapt(Goal(expression="lfr"))
+    world.end()
+    assert {name for adapting, name in looked if not adapting} == set(SINGLES)
+    assert {name for adapting, name in looked if adapting} >= {*SINGLES, "a/server", "b/after"}
 
 
 def struck(placement: str, node: str, neighbour: str) -> tuple[World, SimProcess]:

@@ -111,7 +111,7 @@ class Liveness:
         self.header = JournalHeader(journal)
         self._starvation = Starvation(pid)
         self._activity, self._seen_ns = -1, 0
-        self._seen = False  # the last look saw it alive
+        self._seen = True  # by the last look; there is none yet of a process that has just answered
         self.idle = False  # as the last look found it: it waits, and has done nothing since the one before
 
     def seen_ns(self, now_ns: int) -> int:

@@ -41,7 +41,7 @@ from aftbed.runtime.unix.transport import Line, MemfdMemory, MemfdState, UnixCha
 from aftbed.runtime.unix.workload import Workload
 from aftbed.vehicle.condition import Condition
 
-LOOK_SECONDS: Final = 0.05  # between two looks at all nodes
+LOOK_SECONDS: Final = 0.05  # between two looks for hangs
 LOG_SECONDS: Final = 0.005  # until a line is written: a failover does not wait for that
 # How much may be unread for a report to be sent: of what fits.
 PICTURES_BACKLOG_MAX: Final = 0.5
