@@ -160,7 +160,8 @@ def supervised(run: Run) -> bool:
 
 def needless_stops(run: Run) -> tuple[Breach, ...]:
     """A brick that stopped itself, though nothing that it was given can have been altered, or was late."""
-    if supervised(run) and (run.setup.faults or run.history.events(Event.WATCHDOG_SUSPECT)):
+    injected = run.setup.faults or (run.struck and not run.setup.dooms)  # also while it ran
+    if supervised(run) and (injected or run.history.events(Event.WATCHDOG_SUSPECT)):
         return ()
     if not all(isinstance(fault.action, HARMLESS) for fault in run.setup.faults):
         return ()

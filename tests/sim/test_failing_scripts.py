@@ -10,6 +10,7 @@ from typing import Final
 
 import pytest
 
+from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal
 from aftbed.core.script import ScriptKind
@@ -161,3 +162,19 @@ def test_a_failover_that_was_ordered_before_the_backup_went_is_stale() -> None:
     world.end()
     assert world.controller.deployment.graph.ftm == "tr"
     assert world.controller.executor.stale(ordered)
+
+
+def test_a_supervised_replica_may_stop_where_no_watchdog_is_left_to_suspect_it() -> None:
+    """Found by test_machine in profile `deep`: its Server is killed while the run goes on."""
+    world = World(Setup("lfr+sup", "process", 41532, 96, 500.0))
+    world.start()
+    crash(world, "client")
+    world.inject(Fault(Crash(), "primary", Trigger(Event.SERVER_EXIT.label)))
+    crash(world, "a/watchdog")
+    world.adapt(Goal(expression="pbr"))
+    for node in ("client", "client", "client", "client", "b/watchdog", "b/protocol"):
+        crash(world, node)
+    world.end()
+    run = world.outcome()
+    assert run.history.events(Event.DETECTED_STOP)
+    assert breaches(run) == ()
