@@ -331,11 +331,10 @@ def _real(experiment: Experiment, standing: ExitStack, records: Path | None) -> 
     outcome, reasons = known_outcome(outcome, reasons, verdict)
     result = _result(experiment, evidence, verdict, outcome, reasons)
     end = evidence.record.end or RunEnd()
-    alone = false_alarm(evidence) or (result.unexpected and struck_alone(evidence))
-    alone = alone and end.starved_ms > STALL_MS
-    noisy = noisy or starved(end.starved_ms, end.seconds or 0.0) or _excused(result, end.starved_ms)
-    noisy = noisy or alone or _probe().noisy()
     result = msgspec.structs.replace(result, starved_ms=end.starved_ms)
+    noisy = noisy or starved(end.starved_ms, end.seconds or 0.0) or _excused(result)
+    alone = by_waits(result, evidence)
+    noisy = noisy or alone or _probe().noisy()
     result = without_times(result, alone=alone) if noisy else result
     if records is not None and (result.broken or result.unexpected):
         with suppress(OSError):  # of a full disk: the result stands without it
@@ -355,9 +354,17 @@ def known_outcome(outcome: str, reasons: tuple[str, ...], verdict: Verdict) -> t
     return outcome, reasons
 
 
-def _excused(result: Result, starved_ms: float) -> bool:
+def _excused(result: Result) -> bool:
     """Whether a fault was handled later than its bound, which is that of a machine with shorter waits."""
-    return result.of_bound is not None and result.of_bound > 1 and starved_ms > STALL_MS
+    return result.of_bound is not None and result.of_bound > 1 and result.starved_ms > STALL_MS
+
+
+def by_waits(result: Result, evidence: Evidence) -> bool:
+    """Whether a fault struck the only replica, perhaps, because a node had waited for a CPU: a good replica
+    had been taken for hung, or a new backup was not there yet and the outcome is none that was expected.
+    """
+    alone = false_alarm(evidence) or (result.unexpected and struck_alone(evidence))
+    return alone and result.starved_ms > STALL_MS
 
 
 def _recorded(experiment: Experiment, standing: ExitStack) -> RunRecord:

@@ -160,12 +160,15 @@ def supervised(run: Run) -> bool:
 
 def needless_stops(run: Run) -> tuple[Breach, ...]:
     """A brick that stopped itself, though nothing that it was given can have been altered, or was late."""
-    injected = run.setup.faults or (run.struck and not run.setup.dooms)  # also while it ran
-    if supervised(run) and (injected or run.history.events(Event.WATCHDOG_SUSPECT)):
-        return ()
     if not all(isinstance(fault.action, HARMLESS) for fault in run.setup.faults):
         return ()
     stops = run.history.events(Event.DETECTED_STOP)
+    if supervised(run):
+        if run.setup.faults or run.history.events(Event.WATCHDOG_SUSPECT):
+            return ()
+        # What was struck while the run went on makes late what comes behind it.
+        first_ns = min((one.t_ns for one in run.struck), default=None) if not run.setup.dooms else None
+        stops = [stop for stop in stops if first_ns is None or stop.t_ns < first_ns]
     return tuple(Breach("needless_stop", f"{r.node} stopped at request {r.request_id}") for r in stops)
 
 

@@ -5,10 +5,16 @@ from types import SimpleNamespace
 import pytest
 from campaigns import result
 from msgspec.structs import replace
+from tales import Sums, Tale, good
 
 from aftbed.campaign import experiment
-from aftbed.campaign.experiment import QUIET_SECONDS, Probe, without_times
+from aftbed.campaign.experiment import QUIET_SECONDS, STALL_MS, Probe, by_waits, without_times
+from aftbed.core.events import Event
+from aftbed.judge.checks import Evidence
 from aftbed.judge.intervals import STARVED_MS_MIN, starved
+from aftbed.judge.record import RunRecord
+from aftbed.judge.reference import reference_run
+from aftbed.runtime.unix.options import LoadRun, RunOptions
 
 
 @pytest.mark.parametrize(
@@ -72,6 +78,36 @@ def test_a_fault_that_found_one_replica_because_of_a_busy_machine_is_inconclusiv
 ) -> None:
     found = without_times(result(outcome, unexpected=outcome != "masked"), alone=True)
     assert (found.outcome, found.unexpected) == (after, outcome == after == "sdc")
+
+
+def told(tale: Tale) -> Evidence:
+    record = RunRecord(RunOptions("", "", "", "pbr", "process", 0, LoadRun(3, 0.0)), tale.history(), None)
+    return Evidence(record, reference_run(record.history, Sums()))
+
+
+@pytest.mark.parametrize(
+    ("waited_ms", "unexpected", "alarmed", "word"),
+    [
+        (STALL_MS + 1, True, False, True),
+        (STALL_MS + 1, False, False, False),  # the campaign may be about the loss of both
+        (STALL_MS, True, False, False),  # nobody waited: it is the mechanism that is late
+        (STALL_MS + 1, False, True, True),  # also an expected outcome may have come about by a false alarm
+        (STALL_MS, False, True, False),
+    ],
+)
+def test_a_fault_struck_one_replica_by_the_waits_of_a_busy_machine(
+    waited_ms: float, unexpected: bool, alarmed: bool, word: bool
+) -> None:
+    tale = good().note("recovery.1", Event.RECOVERY_ENTER).note("b/server.1", Event.FAULT_APPLIED)
+    if alarmed:
+        tale = (
+            Tale()
+            .served(1)
+            .note("b/watchdog.1", Event.WATCHDOG_SUSPECT)
+            .note("a/server.1", Event.FAULT_APPLIED)
+        )
+    found = replace(result("unavailable", unexpected=unexpected), starved_ms=waited_ms)
+    assert by_waits(found, told(tale)) is word
 
 
 def test_a_probe_is_calibrated_by_the_machine_it_runs_on() -> None:

@@ -9,6 +9,7 @@ from itertools import pairwise
 from typing import Final
 
 import pytest
+from msgspec.structs import replace
 
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
@@ -19,7 +20,7 @@ from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault
-from aftbed.judge.simulated import breaches
+from aftbed.judge.simulated import breaches, needless_stops
 from aftbed.runtime.sim.node_io import SimChannel
 from aftbed.runtime.sim.world import Setup, World
 
@@ -176,5 +177,9 @@ def test_a_supervised_replica_may_stop_where_no_watchdog_is_left_to_suspect_it()
         crash(world, node)
     world.end()
     run = world.outcome()
-    assert run.history.events(Event.DETECTED_STOP)
     assert breaches(run) == ()
+    (stop,) = run.history.events(Event.DETECTED_STOP)
+    assert run.struck
+    behind = tuple(one._replace(t_ns=stop.t_ns + 1) for one in run.struck)
+    found = needless_stops(replace(run, struck=behind))
+    assert [one.check for one in found] == ["needless_stop"], "a strike excuses what comes behind it only"
