@@ -1,4 +1,4 @@
-"""Cycle time at the client beside its limit, the bare ring; and the delay of one hop.
+"""Cycle time at the client beside its limit, the bare ring, or beside another one; and the delay of one hop.
 
 **Ring.** No mechanism over processes and sockets can be faster: as many hops as a request takes through the
 mechanism, over the same kind of sockets, under the same scheduling policy and pinned alike, in the same
@@ -112,12 +112,7 @@ def bench_cycle(
     size = sum(map(len, sent)) // len(sent)
     share = shares(count, rounds)
 
-    def cycle(number: int) -> list[float]:
-        run = limited_run(
-            ftm, placement, share[number] + WARM_UP, pin=pin, application=application, given=given
-        )
-        return latencies_us(run, skip=WARM_UP)
-
+    cycle = partial(_cycles_us, share, ftm, placement, pin=pin, application=application, given=given)
     found = in_turn(len(share), cycle, lambda number: ring_us(shape, size, share[number], pin=pin), show=show)
     cycles, ring = ([us for one in values for us in one] for values in (found.figures, found.limits))
     beside = beside_limit(shape.name, found.figures, found.limits, 1)
@@ -138,6 +133,63 @@ def bench_cycle(
         ratio=beside.ratio,
         machine=found.machine,
     )
+
+
+class CycleBesideResult(InRounds, frozen=True):
+    """The document of `aftbed bench cycle --beside`, whose limit is a cycle, too."""
+
+    ftm: str
+    placement: str
+    requests: int
+    cycle_us: Percentiles
+    beside_ftm: str
+    beside_placement: str
+
+
+def bench_cycle_beside(
+    ours: tuple[str, str],
+    other: tuple[str, str],
+    count: int,
+    *,
+    pin: bool = True,
+    rounds: int = ROUNDS,
+    application: str = "",
+    given: GivenRequests | None = None,
+    show: Show = unshown,
+) -> CycleBesideResult:
+    """`count` requests under each of two, mechanism and placement, in rounds, in turn."""
+    for side in (ours, other):
+        build(*side)  # refuses what there is none of, before anything is measured
+    share = shares(count, rounds)
+    measure = partial(_cycles_us, share, pin=pin, application=application, given=given)
+    found = in_turn(len(share), partial(measure, *ours), partial(measure, *other), show=show)
+    beside = beside_limit(f"cycle under {', '.join(other)}", found.figures, found.limits, 1)
+    cycles = list(itertools.chain.from_iterable(found.figures))
+    return CycleBesideResult(
+        *ours,
+        len(cycles),
+        percentiles(cycles, 1),
+        *other,
+        limit=beside.limit,
+        ratio=beside.ratio,
+        machine=found.machine,
+    )
+
+
+def _cycles_us(
+    share: list[int],
+    ftm: str,
+    placement: str,
+    number: int,
+    *,
+    pin: bool,
+    application: str,
+    given: GivenRequests | None,
+) -> list[float]:
+    """The cycles of round `number` (us), of a run of its own, after a warm-up."""
+    count = share[number] + WARM_UP
+    run = limited_run(ftm, placement, count, pin=pin, application=application, given=given)
+    return latencies_us(run, skip=WARM_UP)
 
 
 # -- ring -------------------------------------------------------------------------------------------

@@ -3,8 +3,7 @@
 A line names the command that measures it. Each command is run once in a pass, in an interpreter of its own,
 as a user would start it; several lines may read its document. A figure stands beside its limit. The speed of
 a machine changes from minute to minute, so what can be compared is the ratio of the two, and nearly every
-document has it: both were measured in turn (`rounds`). A figure that is compared with that of another line
-(`lfr` with `pbr`) was measured minutes apart from it.
+document has it: both were measured in turn (`rounds`).
 
 Of a ratio that a document has, the table of one pass shows as the p50 the median of the rounds with its
 quartiles, and the p99 over all rounds (`rounds.QuantileRatio`). Of several passes, one behind the other, it
@@ -45,23 +44,18 @@ Document = dict[str, object]
 
 
 class FigureLimit(msgspec.Struct, frozen=True):
-    """What a figure is compared with: the path in a document, of the same command if none is given.
-
-    Without a name, it is the one that the document gives.
-    """
+    """What a figure is compared with: the path in the document. Without a name, the one that stands there."""
 
     name: str
     path: str
-    command: str = ""
 
 
 class TableLine(msgspec.Struct, frozen=True):
     """A line of the table. `figure` is a path in the document of `aftbed bench COMMAND`.
 
     `goal`: the greatest value of each quantile's ratio to the limit; without a limit, of the figure itself;
-    the least one where `more_is_better`. `ratio`: path of a ratio that the document has, a `Ratio` or the
-    number of the p50; "": the quotient is made here, of what was measured minutes apart. `counted`: the
-    values are numbers of events, which several passes add up.
+    the least one where `more_is_better`. `ratio`: path of that to the limit, a `Ratio` or the number of the
+    p50. `counted`: the values are numbers of events, which several passes add up.
     """
 
     what: str
@@ -75,13 +69,8 @@ class TableLine(msgspec.Struct, frozen=True):
     counted: bool = False
 
 
-def _cycle(what: str, options: str, limit: FigureLimit, **goal: float) -> TableLine:
-    ratio = OWN_RATIO if limit is OWN else ""
-    return TableLine(what, f"cycle --ftm {options}", "cycle_us", "us", limit, ratio, goal)
-
-
-def _cycle_of(ftm: str) -> FigureLimit:
-    return FigureLimit(f"cycle under `{ftm}`", "cycle_us", f"cycle --ftm {ftm}")
+def _cycle(what: str, options: str, **goal: float) -> TableLine:
+    return TableLine(what, f"cycle --ftm {options}", "cycle_us", "us", OWN, OWN_RATIO, goal)
 
 
 def _recovery(what: str, options: str) -> TableLine:
@@ -117,13 +106,15 @@ RECIPE: Final = "adapt --from pbr --to pbr+tr --recipe paper"
 SIM_CAMPAIGN: Final = "campaign --sim --experiments 4000"
 SIMULATOR: Final = "simulator --ftm pbr"
 LINES: Final = (
-    _cycle("cycle under `pbr`, a process per brick", "pbr", OWN, p50=1.35),
-    _cycle("cycle under `pbr`, a process per replica", "pbr --placement replica", OWN, p50=2.0),
-    _cycle("the same beside a process per brick", "pbr --placement replica", _cycle_of("pbr"), p50=0.5),
-    _cycle("cycle of the bare server", "none", OWN),
-    _cycle("cycle under `lfr`", "lfr", _cycle_of("pbr"), p50=0.9),
-    _cycle("cycle under `pbr+tr`", "pbr+tr", _cycle_of("pbr"), p50=1.8),
-    _cycle("cycle under `lfr+tr`", "lfr+tr", _cycle_of("lfr"), p50=1.8),
+    _cycle("cycle under `pbr`, a process per brick", "pbr", p50=1.35),
+    _cycle("cycle under `pbr`, a process per replica", "pbr --placement replica", p50=2.0),
+    _cycle(
+        "the same beside a process per brick", "pbr --placement replica --beside-placement process", p50=0.5
+    ),
+    _cycle("cycle of the bare server", "none"),
+    _cycle("cycle under `lfr`", "lfr --beside pbr", p50=0.9),
+    _cycle("cycle under `pbr+tr`", "pbr+tr --beside pbr", p50=1.8),
+    _cycle("cycle under `lfr+tr`", "lfr+tr --beside lfr", p50=1.8),
     TableLine("delay of one hop under `pbr`", "hops --ftm pbr", "hop_ns", "ns"),
     _recovery("SIGKILL of the primary to the next good reply, `pbr`", "--ftm pbr"),
     TableLine("its parts, p50", "recovery --ftm pbr", "parts_ms.*.p50", "ms"),
@@ -239,7 +230,7 @@ def bench_all(
         for one, command in words.items():
             show(number * len(words) + len(found), passes * len(words))
             found[one] = tried(f"aftbed bench {command}", partial(run, command), log)
-        by_pass.append([_number(line, found) for line in LINES])
+        by_pass.append([_number(line, found[line.command]) for line in LINES])
         yield Numbers(
             datetime.datetime.now(datetime.UTC).date().isoformat(),
             code_version(),
@@ -257,14 +248,14 @@ def _measured(command: str) -> Document:
     return msgspec.json.decode(run_python(arguments, COMMAND_SECONDS_MAX), type=Document)
 
 
-def _number(line: TableLine, found: dict[str, Document]) -> Number:
-    document, measured = found[line.command], figure_at(found[line.command], line.figure)
+def _number(line: TableLine, document: Document) -> Number:
+    measured = figure_at(document, line.figure)
     ratios: dict[str, float] = {}
     limit_p50, limit_name, rounds = None, "", None
     if line.limit is not None:
         if list(measured) == [""]:
             measured = {"p50": measured[""]}  # one value for each round: this is their median
-        limit = _at(found[line.limit.command or line.command], line.limit.path)
+        limit = _at(document, line.limit.path)
         limit_p50, limit_name = figure_at(limit, "p50")[""], line.limit.name or str(_at(limit, "name"))
         ratios, rounds = _ratios(line, document, measured, limit_p50)
     return Number(
@@ -326,11 +317,9 @@ def _ratios(
 ) -> tuple[dict[str, float], Ratio | None]:
     """Of the p50 and of what the goal names; and the ratio of rounds, if the document has one."""
     names = dict.fromkeys(("p50", *line.goal))
-    quotients = {name: round(measured[name] / limit_p50, 2) for name in names}
-    if not line.ratio:
-        return quotients, None
     own = _at(document, line.ratio)
     if not isinstance(own, dict):
+        quotients = {name: round(measured[name] / limit_p50, 2) for name in names}
         return quotients | {"p50": round(msgspec.convert(own, float), 2)}, None
     rounds = msgspec.convert(own, Ratio)
     in_rounds = {"p50": rounds.p50.median, "p99": rounds.p99.all}

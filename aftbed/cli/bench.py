@@ -4,6 +4,8 @@ The processes that are measured are forked from this one. So what only some figu
 imported where it is used.
 """
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -12,7 +14,7 @@ import typer
 
 from aftbed.bench import ballast
 from aftbed.bench.adaptation import bench_adapt
-from aftbed.bench.cycle import bench_cycle, bench_hops
+from aftbed.bench.cycle import bench_cycle, bench_cycle_beside, bench_hops
 from aftbed.bench.recovery import bench_recovery
 from aftbed.bench.resources import bench_launch, bench_memory
 from aftbed.bench.rounds import ROUNDS, text
@@ -49,24 +51,29 @@ def cycle(
     requests: Annotated[
         str | None, typer.Option(help="What --app is sent: FILE (CSV, JSON lines) or MODULE:FUNCTION.")
     ] = None,
+    beside: Annotated[
+        str | None, typer.Option(help="A mechanism whose cycle is the limit in the place of the bare ring.")
+    ] = None,
+    beside_placement: Annotated[
+        str | None,
+        typer.Option(metavar=choices(PLACEMENTS), help="The placement of --beside, if it is another one."),
+    ] = None,
     pin: Pin = True,
     rounds: Rounds = ROUNDS,
     json: Json = False,
 ) -> None:
-    """Cycle time at the client, alternating with a bare ring of the same number of hops."""
+    """Cycle time at the client, alternating with a bare ring of the same number of hops, or with --beside."""
     application, given = located(app) if app is not None else "", None
     if requests is not None:
         given = requests_from(located_requests(requests), SENT_FUNCTION, 0, OWN_CODE)
     with _measuring("cycle", as_json=json) as progress:
-        result = bench_cycle(
-            ftm,
-            placement,
-            count,
-            pin=pin,
-            rounds=rounds,
-            application=application,
-            given=given,
-            show=progress.show,
+        if beside is None and beside_placement is None:
+            measure: Callable[..., msgspec.Struct] = partial(bench_cycle, ftm, placement)
+        else:
+            other = beside or ftm, beside_placement or placement
+            measure = partial(bench_cycle_beside, (ftm, placement), other)
+        result = measure(
+            count, pin=pin, rounds=rounds, application=application, given=given, show=progress.show
         )
     _print(result, as_json=json)
 

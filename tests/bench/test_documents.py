@@ -48,6 +48,27 @@ def test_a_cycle(home: Home) -> None:
     assert set(found["cycle_us"]) == set(found["ring_us"]) == QUANTILES
 
 
+@pytest.mark.parametrize(
+    ("words", "ftm", "placement"),
+    [(("--beside", "none"), "none", "replica"), (("--beside-placement", "single"), "pbr", "single")],
+)
+def test_a_cycle_beside_another(words: tuple[str, ...], ftm: str, placement: str, home: Home) -> None:
+    found = document("cycle", "--count", "100", "--rounds", "1", "--placement", "replica", *words)
+    check_beside(found, f"cycle under {ftm}, {placement}", 1)
+    assert (found["ftm"], found["placement"], found["requests"]) == ("pbr", "replica", 100)
+    assert (found["beside_ftm"], found["beside_placement"]) == (ftm, placement)
+    assert set(found["cycle_us"]) == QUANTILES
+
+
+@pytest.mark.parametrize(
+    ("option", "reason"),
+    [("--beside", "unknown FTM 'nope'"), ("--beside-placement", "unknown placement 'nope'")],
+)
+def test_nothing_is_measured_beside_what_there_is_none_of(option: str, reason: str) -> None:
+    done = aftbed("bench", "cycle", option, "nope")
+    assert done.code == 2 and reason in done.err and done.out == ""
+
+
 def test_a_recovery(home: Home) -> None:
     found = document("recovery", "--kills", "2")
     check_beside(found, DEATH, 2)

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aftbed.bench import cycle
 from aftbed.bench import rounds as module
 from aftbed.bench.rounds import (
     FAILURES_MAX,
@@ -287,3 +288,19 @@ def test_the_keys_of_a_document() -> None:
         "mhz_max",
         "failures",
     }
+
+
+def test_one_cycle_is_measured_in_turn_with_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[tuple[str, str, int]] = []
+
+    def cycles_us(share: list[int], ftm: str, placement: str, number: int, **_: object) -> list[float]:
+        begun.append((ftm, placement, share[number]))
+        return [40.0 if placement == "replica" else 100.0] * share[number]
+
+    monkeypatch.setattr(cycle, "_cycles_us", cycles_us)
+    found = cycle.bench_cycle_beside(("pbr", "replica"), ("lfr", "process"), 5, rounds=2)
+    assert sorted(begun[:2]) == [("lfr", "process", 3), ("pbr", "replica", 3)]
+    assert sorted(begun[2:]) == [("lfr", "process", 2), ("pbr", "replica", 2)]
+    assert begun[0][0] != begun[2][0], "the one that comes first alternates"
+    assert (found.cycle_us.p50, found.limit.p50, found.ratio.p50.median) == (40.0, 100.0, 0.4)
+    assert (found.limit.name, found.requests) == ("cycle under lfr, process", 5)
