@@ -90,7 +90,7 @@ def told(tale: Tale) -> Evidence:
     [
         (STALL_MS + 1, True, False, True),
         (STALL_MS + 1, False, False, False),  # the campaign may be about the loss of both
-        (STALL_MS, True, False, False),  # nobody waited: it is the mechanism that is late
+        (STALL_MS, True, False, False),  # no node waited: the mechanism is late
         (STALL_MS + 1, False, True, True),  # also an expected outcome may have come about by a false alarm
         (STALL_MS, False, True, False),
     ],
