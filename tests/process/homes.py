@@ -51,6 +51,14 @@ def _shared_memory() -> set[Path]:
     return {path for path in SHARED_MEMORY.iterdir() if not path.name.startswith(("sem.", PREFIX))}
 
 
+def _name_and_state(pid: int) -> str:
+    """`a/server S` (proc(5)); of one that has just gone, nothing."""
+    with contextlib.suppress(OSError):
+        name, _, rest = Path(f"/proc/{pid}/stat").read_text().partition("(")[2].rpartition(") ")
+        return f"{name} {rest[:1]}"
+    return ""
+
+
 class Home:
     """The XDG_RUNTIME_DIR of one test. Its path is short: a socket's may have 108 bytes."""
 
@@ -89,7 +97,7 @@ class Home:
 
     def left(self) -> list[str]:
         """Everything that a run would have left behind (G7)."""
-        found = [f"process {pid}" for pid in self.processes()]
+        found = [f"process {pid} ({_name_and_state(pid)})" for pid in self.processes()]
         found += [f"directory {path}" for path in self.runs()]
         new = _shared_memory() - self._shared
         return found + [f"shared memory {p}" for p in new if not self._is_mapped_elsewhere(p)]

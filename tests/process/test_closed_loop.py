@@ -93,9 +93,13 @@ def test_a_loss_is_told_by_its_cause(home: Home, tmp_path: Path, fault: str, eve
 
 
 def test_what_the_run_refuses_is_an_outcome(home: Home, tmp_path: Path) -> None:
-    """The function has lost its state access meanwhile, and TR needs it."""
+    """The function has lost its state access meanwhile, and TR needs it.
+
+    The second fault strikes 1.5 s behind the beginning of that update, which has ended by then.
+    """
     closed = "update app to aftbed.vehicle.aeb.variants:WithoutStateAccess at request 20"
-    options = ("--ftm", "lfr", *LOAD, *DIVERGE, "--adapt", closed, "--json")
+    late = ("--inject", "bitflip result in b nth 500", "--inject", "bitflip result in b nth 620")
+    options = ("--ftm", "lfr", *LOAD, *late, "--adapt", closed, "--json")
     path = policy(tmp_path, TWO_DIVERGENCES)
     done = aftbed("run", *options, "--policy", path)
     verdict = done.verdict()
