@@ -363,6 +363,15 @@ MUTANTS: Final = (
         (KILLS + "test_there_are_the_seventeen_processes_of_the_paper",),
     ),
     SourceMutant(
+        "what forks the spares outlives its zygote",
+        "G7",
+        f"{UNIX}/zygote.py",
+        "        linux.die_with(zygote)  # also where it is stopped: its spares wait for its end\n",
+        "",
+        PROCESS,
+        ("tests/process/test_process_pool.py",),
+    ),
+    SourceMutant(
         "a run that ends while an adaptation is observed has nothing under way",
         "G5",
         "aftbed/runtime/run_controller.py",

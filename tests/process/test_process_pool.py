@@ -1,11 +1,13 @@
 """The supervisor's pool of processes, with real zygotes."""
 
+import signal
 import subprocess
 import sys
 from pathlib import Path
 from typing import Final
 
 import pytest
+from liveruns import ended, state_of, until
 
 SECONDS_MAX: Final = 60.0
 OWED: Final = 5
@@ -65,6 +67,26 @@ pool.zygotes[LIGHT].line = Full(pool.zygotes[LIGHT].line)
 pool.park(LIGHT, {OWED})
 """
 
+# Of the two forks the second is that of the intermediate, which stops there.
+STOPPED: Final = """
+import os, signal
+
+from aftbed.runtime.unix import zygote
+
+def stop_and_fork():
+    print(os.getpid(), flush=True)
+    os.kill(os.getpid(), signal.SIGSTOP)
+    return fork()
+
+def fork_and_stop():
+    os.fork = stop_and_fork
+    return fork()
+
+fork, os.fork = os.fork, fork_and_stop
+os.dup2(0, zygote.INHERITED_FD)
+zygote._fork_spares([os.dup(0)], os.getpid())
+"""
+
 
 def supervise(what: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
@@ -88,3 +110,14 @@ def test_a_run_in_which_no_spare_comes_to_its_first_message_ends_with_the_reason
     done = supervise(NEVER, tmp_path)
     assert done.returncode == 1 and not done.stdout
     assert "no process starts: 100 in a row ended before their first message" in done.stderr
+
+
+@pytest.mark.process
+def test_what_forks_the_spares_ends_with_its_zygote_also_where_it_is_stopped() -> None:
+    command = [sys.executable, "-c", STOPPED]
+    with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE) as zygote:
+        assert zygote.stdout is not None
+        intermediate = int(zygote.stdout.readline())
+        until(lambda: state_of(intermediate) == "T", "the intermediate to stop")
+        zygote.send_signal(signal.SIGKILL)
+    assert ended(intermediate)

@@ -139,8 +139,10 @@ def _fork_spares(fds: list[int], supervisor: int) -> None:
     Raises OSError if one cannot be forked.
     """
     alive, life = os.pipe()
+    zygote = os.getpid()
     intermediate = os.fork()
     if intermediate == 0:
+        linux.die_with(zygote)  # also where it is stopped: its spares wait for its end
         os.close(INHERITED_FD)
         for descriptor in fds:
             try:
