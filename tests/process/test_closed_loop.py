@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from liveruns import WAIT_SECONDS_MAX, Done, Home, aftbed
+from liveruns import ENDLESS, WAIT_SECONDS_MAX, Command, Done, Home, adapted, aftbed
 from sampling import every
 from terminal import Terminal
 
@@ -93,20 +93,22 @@ def test_a_loss_is_told_by_its_cause(home: Home, tmp_path: Path, fault: str, eve
 
 
 def test_what_the_run_refuses_is_an_outcome(home: Home, tmp_path: Path) -> None:
-    """The function has lost its state access meanwhile, and TR needs it.
-
-    The second fault strikes 1.5 s behind the beginning of that update, which has ended by then.
-    """
-    closed = "update app to aftbed.vehicle.aeb.variants:WithoutStateAccess at request 20"
-    late = ("--inject", "bitflip result in b nth 500", "--inject", "bitflip result in b nth 620")
-    options = ("--ftm", "lfr", *LOAD, *late, "--adapt", closed, "--json")
-    path = policy(tmp_path, TWO_DIVERGENCES)
-    done = aftbed("run", *options, "--policy", path)
-    verdict = done.verdict()
+    """The function has lost its state access when the second divergence comes, and TR needs it."""
+    record, path = tmp_path / "record", policy(tmp_path, TWO_DIVERGENCES)
+    with Command("--ftm", "lfr", "--load", f"{ENDLESS}@400", "--policy", path, "--record", record) as command:
+        command.started()
+        closed = adapted("update", "app", "--to", "aftbed.vehicle.aeb.variants:WithoutStateAccess")
+        assert closed.code == 0, closed.out + closed.err
+        for nth in (1, 2):
+            struck = aftbed("inject", "bitflip result in b")
+            assert struck.code == 0, struck.out + struck.err
+            command.wait_for_line("bitflip result in b: activated", nth)
+        command.wait_for_line(" proposal: ")
+        assert aftbed("stop").code == 0
+        done = command.done()
     refused = "policy_followed: lfr to lfr+tr (2 divergence within 10 s): refused: "
-    assert done.code == 3 and verdict.reasons[0].startswith(refused)
-    assert isinstance(verdict.proposals, list)
-    one = verdict.proposals[0]
+    assert done.code == 3 and f"\n  because    {refused}" in done.out
+    (one,) = read_proposals(record) or ()
     assert one.outcome == "refused" and "tr needs state access" in one.why
     assert one.consistent_after_ms is None
 
