@@ -95,34 +95,53 @@ class CycleResult(InRounds, frozen=True):
     ratio_rounds: tuple[float, ...]
 
 
-def bench_cycle(
-    ftm: str,
-    placement: str,
-    count: int,
-    *,
-    pin: bool = True,
-    rounds: int = ROUNDS,
-    application: str = "",
-    given: GivenRequests | None = None,
-    show: Show = unshown,
-) -> CycleResult:
-    """`count` requests in rounds with the ring; of a function of the user, and what it is sent, if given."""
-    shape = ring_of(build(ftm, placement))
-    sent = given.requests if given is not None else sample_requests(0, 64, fixed=is_foreign(application))
+class CycleRun(NamedTuple):
+    """What is measured: one mechanism in one placement, a run of its own in each round.
+
+    `application`: the function of a user, `given`: what it is sent; see `limited_run`.
+    """
+
+    ftm: str
+    placement: str
+    pin: bool = True
+    application: str = ""
+    given: GivenRequests | None = None
+
+    def cycles_us(self, count: int) -> list[float]:
+        """The cycles of `count` requests (us), after a warm-up. Raises HarnessError."""
+        run = limited_run(
+            self.ftm,
+            self.placement,
+            count + WARM_UP,
+            pin=self.pin,
+            application=self.application,
+            given=self.given,
+        )
+        return latencies_us(run, skip=WARM_UP)
+
+
+def bench_cycle(ours: CycleRun, count: int, *, rounds: int = ROUNDS, show: Show = unshown) -> CycleResult:
+    """`count` requests in rounds, in turn with the ring."""
+    shape = ring_of(build(ours.ftm, ours.placement))
+    fixed = is_foreign(ours.application)
+    sent = ours.given.requests if ours.given is not None else sample_requests(0, 64, fixed=fixed)
     size = sum(map(len, sent)) // len(sent)
     share = shares(count, rounds)
-
-    cycle = partial(_cycles_us, share, ftm, placement, pin=pin, application=application, given=given)
-    found = in_turn(len(share), cycle, lambda number: ring_us(shape, size, share[number], pin=pin), show=show)
+    found = in_turn(
+        len(share),
+        lambda number: ours.cycles_us(share[number]),
+        lambda number: ring_us(shape, size, share[number], pin=ours.pin),
+        show=show,
+    )
     cycles, ring = ([us for one in values for us in one] for values in (found.figures, found.limits))
     beside = beside_limit(shape.name, found.figures, found.limits, 1)
     medians = [
-        quantile(ours, 0.5) / quantile(bare, 0.5)
-        for ours, bare in zip(found.figures, found.limits, strict=True)
+        quantile(of_run, 0.5) / quantile(bare, 0.5)
+        for of_run, bare in zip(found.figures, found.limits, strict=True)
     ]
     return CycleResult(
-        ftm,
-        placement,
+        ours.ftm,
+        ours.placement,
         len(cycles),
         percentiles(cycles, 1),
         percentiles(ring, 1),
@@ -147,49 +166,32 @@ class CycleBesideResult(InRounds, frozen=True):
 
 
 def bench_cycle_beside(
-    ours: tuple[str, str],
-    other: tuple[str, str],
-    count: int,
-    *,
-    pin: bool = True,
-    rounds: int = ROUNDS,
-    application: str = "",
-    given: GivenRequests | None = None,
-    show: Show = unshown,
+    ours: CycleRun, other: CycleRun, count: int, *, rounds: int = ROUNDS, show: Show = unshown
 ) -> CycleBesideResult:
-    """`count` requests under each of two, mechanism and placement, in rounds, in turn."""
+    """`count` requests in rounds, in turn with as many of `other`."""
     for side in (ours, other):
-        build(*side)  # refuses what there is none of, before anything is measured
+        build(side.ftm, side.placement)  # refuses what there is none of, before anything is measured
     share = shares(count, rounds)
-    measure = partial(_cycles_us, share, pin=pin, application=application, given=given)
-    found = in_turn(len(share), partial(measure, *ours), partial(measure, *other), show=show)
-    beside = beside_limit(f"cycle under {', '.join(other)}", found.figures, found.limits, 1)
+    found = in_turn(
+        len(share),
+        lambda number: ours.cycles_us(share[number]),
+        lambda number: other.cycles_us(share[number]),
+        show=show,
+    )
+    name = f"cycle under {other.ftm}, {other.placement}"
+    beside = beside_limit(name, found.figures, found.limits, 1)
     cycles = list(itertools.chain.from_iterable(found.figures))
     return CycleBesideResult(
-        *ours,
+        ours.ftm,
+        ours.placement,
         len(cycles),
         percentiles(cycles, 1),
-        *other,
+        other.ftm,
+        other.placement,
         limit=beside.limit,
         ratio=beside.ratio,
         machine=found.machine,
     )
-
-
-def _cycles_us(
-    share: list[int],
-    ftm: str,
-    placement: str,
-    number: int,
-    *,
-    pin: bool,
-    application: str,
-    given: GivenRequests | None,
-) -> list[float]:
-    """The cycles of round `number` (us), of a run of its own, after a warm-up."""
-    count = share[number] + WARM_UP
-    run = limited_run(ftm, placement, count, pin=pin, application=application, given=given)
-    return latencies_us(run, skip=WARM_UP)
 
 
 # -- ring -------------------------------------------------------------------------------------------

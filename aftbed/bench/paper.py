@@ -29,7 +29,7 @@ from typing import Final
 import msgspec
 
 from aftbed.bench.adaptation import AdaptationResult, bench_adapt
-from aftbed.bench.cycle import CycleResult, bench_cycle, ring_p50_us
+from aftbed.bench.cycle import CycleResult, CycleRun, bench_cycle, ring_p50_us
 from aftbed.bench.recovery import bench_recovery
 from aftbed.bench.resources import (
     IDLE_HZ,
@@ -316,7 +316,7 @@ class _Measurements:
     def cycle(self, ftm: str, placement: str) -> CycleResult:
         requests, rounds = self._effort.requests, self._effort.rounds
         what = f"cycle of {ftm}, placement {placement}"
-        return self._tried(what, partial(bench_cycle, ftm, placement, requests, rounds=rounds))
+        return self._tried(what, partial(bench_cycle, CycleRun(ftm, placement), requests, rounds=rounds))
 
     def recoveries(self) -> Iterator[Figure]:
         kills = self._effort.kills

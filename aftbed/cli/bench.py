@@ -14,7 +14,7 @@ import typer
 
 from aftbed.bench import ballast
 from aftbed.bench.adaptation import bench_adapt
-from aftbed.bench.cycle import bench_cycle, bench_cycle_beside, bench_hops
+from aftbed.bench.cycle import CycleRun, bench_cycle, bench_cycle_beside, bench_hops
 from aftbed.bench.recovery import bench_recovery
 from aftbed.bench.resources import bench_launch, bench_memory
 from aftbed.bench.rounds import ROUNDS, text
@@ -66,15 +66,14 @@ def cycle(
     application, given = located(app) if app is not None else "", None
     if requests is not None:
         given = requests_from(located_requests(requests), SENT_FUNCTION, 0, OWN_CODE)
+    ours = CycleRun(ftm, placement, pin, application, given)
     with _measuring("cycle", as_json=json) as progress:
         if beside is None and beside_placement is None:
-            measure: Callable[..., msgspec.Struct] = partial(bench_cycle, ftm, placement)
+            measure: Callable[..., msgspec.Struct] = partial(bench_cycle, ours)
         else:
-            other = beside or ftm, beside_placement or placement
-            measure = partial(bench_cycle_beside, (ftm, placement), other)
-        result = measure(
-            count, pin=pin, rounds=rounds, application=application, given=given, show=progress.show
-        )
+            other = ours._replace(ftm=beside or ftm, placement=beside_placement or placement)
+            measure = partial(bench_cycle_beside, ours, other)
+        result = measure(count, rounds=rounds, show=progress.show)
     _print(result, as_json=json)
 
 

@@ -293,12 +293,13 @@ def test_the_keys_of_a_document() -> None:
 def test_one_cycle_is_measured_in_turn_with_another(monkeypatch: pytest.MonkeyPatch) -> None:
     begun: list[tuple[str, str, int]] = []
 
-    def cycles_us(share: list[int], ftm: str, placement: str, number: int, **_: object) -> list[float]:
-        begun.append((ftm, placement, share[number]))
-        return [40.0 if placement == "replica" else 100.0] * share[number]
+    def cycles_us(run: cycle.CycleRun, count: int) -> list[float]:
+        begun.append((run.ftm, run.placement, count))
+        return [40.0 if run.placement == "replica" else 100.0] * count
 
-    monkeypatch.setattr(cycle, "_cycles_us", cycles_us)
-    found = cycle.bench_cycle_beside(("pbr", "replica"), ("lfr", "process"), 5, rounds=2)
+    monkeypatch.setattr(cycle.CycleRun, "cycles_us", cycles_us)
+    ours, other = cycle.CycleRun("pbr", "replica"), cycle.CycleRun("lfr", "process")
+    found = cycle.bench_cycle_beside(ours, other, 5, rounds=2)
     assert sorted(begun[:2]) == [("lfr", "process", 3), ("pbr", "replica", 3)]
     assert sorted(begun[2:]) == [("lfr", "process", 2), ("pbr", "replica", 2)]
     assert begun[0][0] != begun[2][0], "the one that comes first alternates"
