@@ -17,6 +17,7 @@ from typing import Final, TypeVar
 
 import pytest
 
+from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.run_directory import suits
 
 WAIT_SECONDS_MAX: Final = 60.0  # a wait ends with its event: this is for machines under load
@@ -68,21 +69,25 @@ class Home:
         self._mark = f"XDG_RUNTIME_DIR={self.path}".encode()
         self._before = _pids()
         self._shared = _shared_memory()
-        self.forks: list[int] = []
+        self._forks: set[tuple[int, int]] = set()  # with the time of their start: a pid is given again
+
+    def forked(self, pid: int) -> None:
+        """A child of this process, which does not carry the name of the home, runs in it."""
+        self._forks.add((pid, linux.started(pid)))
 
     def processes(self) -> list[int]:
         """The pids of what runs in this home, this process aside.
 
-        What ran before the home was made is not looked at: a machine has hundreds of processes. Its pid is
-        not given to another one during a test: Linux gives all others first.
+        What ran before the home was made is not looked at: a machine has hundreds of processes. A test that
+        starts more than all pids there are may so overlook one.
         """
         return [pid for pid in _pids() - self._before if self._is_ours(pid)]
 
     def _is_ours(self, pid: int) -> bool:
         process = Path(f"/proc/{pid}")
         try:
-            if pid in self.forks:
-                return (process / "stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+            if (pid, linux.started(pid)) in self._forks:
+                return not linux.dead(pid)
             environment = (process / "environ").read_bytes().split(b"\0")
             if f"XDG_RUNTIME_DIR={FORKED}".encode() in environment:
                 return f"/memfd:{self.path} " in (process / "maps").read_text()

@@ -145,7 +145,8 @@ class Started:
             bus_open=bus_open,
         )
         self.launched = launch(options, listener)
-        home.forks += [self.launched.supervisor, self.launched.warden]
+        for pid in (self.launched.supervisor, self.launched.warden):
+            home.forked(pid)
         self.private = self.launched.private
         self.events: list[dict[str, object]] = []
         self._ended = self._closed = False
