@@ -271,7 +271,7 @@ def test_what_does_not_end_in_time_is_named(home: Home) -> None:
         with traced(pid):
             outcome = run.stop()
     assert outcome.verdict.verdict == "fail"
-    assert outcome.verdict.reasons == [f"clean_exit: left behind: ['zygote ({pid})']"]
+    assert outcome.verdict.reasons == [f"clean_exit: left behind: ['zygote ({pid}), state Z']"]
 
 
 def test_the_record_of_a_killed_run_holds_every_reply_that_was_given(home: Home) -> None:

@@ -395,6 +395,7 @@ class Supervisor:
     def _kill_all(self) -> list[str]:
         """Kill all processes and reap them; what is left after a second in which they had a CPU to die on.
 
+        Of each its name, pid and state (proc(5)): `D` waits for the kernel, `Z` is held by a tracer.
         Watchdogs and Recovery come first, so that the shutdown triggers no failover; see `killed_in_turn`.
         """
         dying = self.pool.processes
@@ -417,9 +418,10 @@ class Supervisor:
             if late and not any(starvation[p.pid].starves(now_ns) for p in dying):
                 break  # while some die, the rest may become ours to reap: a zygote's children
             time.sleep(0.001)  # no event to wait for: a killed process is a matter of a millisecond
+        left = [f"{p.name} ({p.pid}), state {starvation[p.pid].state()}" for p in dying]
         for one in starvation.values():
             one.close()
-        return [f"{p.name} ({p.pid})" for p in dying]
+        return left
 
 
 def drains_too_long(seconds: float, starved_s: float) -> bool:
