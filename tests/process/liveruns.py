@@ -237,10 +237,11 @@ class Started:
         return bool(status["backup"]) and not status["busy"]
 
     def states(self) -> str:
-        """Its processes, spares and zygotes too, and what each waits for: where a run does not go on."""
-        found = psutil.Process(self.launched.supervisor).children(recursive=True)
+        """The supervisor and all its processes, and what each waits for: where a run does not go on."""
+        supervisor = psutil.Process(self.launched.supervisor)
         return "".join(
-            f"    {one.pid} of {one.ppid()} {one.name()} {one.status()} {wait_of(one.pid)}\n" for one in found
+            f"    {one.pid} of {one.ppid()} {one.name()} {one.status()} {wait_of(one.pid)}\n"
+            for one in (supervisor, *supervisor.children(recursive=True))
         )
 
     def descriptors(self, pid: int) -> int:
