@@ -40,9 +40,9 @@ def trail(mechanisms: tuple[str, ...]) -> list[str]:
     return found[::-1]
 
 
-def adapt(run: Started, goal: Goal) -> dict[str, object]:
+def adapt(run: Started, goal: Goal, tries: int = ADAPT_TRIES) -> dict[str, object]:
     """The answer of the run; asked again where a busy machine gave the adaptation no time."""
-    for tries_left in reversed(range(ADAPT_TRIES)):
+    for tries_left in reversed(range(tries)):
         try:
             found = control_client.ask(
                 run.private, control_client.AdaptCommand(goal), control_client.ADAPT_SECONDS_MAX

@@ -17,7 +17,7 @@ from typing import Final
 
 import psutil
 import pytest
-from liveruns import Home, Outcome, Started, until
+from liveruns import NO_TIME, Home, Outcome, Started, until
 from sampling import sampled as combinations
 from test_adaptations import (
     PAPER,
@@ -45,7 +45,7 @@ PAIRS: Final = tuple(itertools.permutations(PAPER, 2))
 SEED: Final = 20161118
 SAMPLED: Final = 12
 STRIKES_MAX: Final = 40  # in one run
-FALSE_ALARMS_MAX: Final = 2  # of a walk: runs in which a busy machine had a replica taken for hung
+FALSE_ALARMS_MAX: Final = 2  # of a walk: runs in which a busy machine had the strike not come
 OTHER: Final = {"a": "b", "b": "a"}
 
 
@@ -58,41 +58,49 @@ def mirrored(node: str, leader: str) -> str:
     return replica.replace(stem, OTHER[stem]) + (f"/{part}" if part else "")
 
 
-def strike(run: Started, struck: Strike, placement: str) -> str:
-    """One adaptation with one death; the mechanism that runs after it."""
+def strike(run: Started, struck: Strike, placement: str) -> tuple[str, bool]:
+    """One adaptation with one death; the mechanism that runs after it, and whether there was time for it.
+
+    Without, it is not asked again: the fault has counted the steps of the first time.
+    """
     leader = str(run.status()["leader"])
     fault = Fault(Crash(), mirrored(struck.node, leader), Trigger(struck.when.label, struck.step))
     control_client.ask(run.private, control_client.InjectCommand(fault))
-    came_to = (
-        struck.new if how_it_ended(run, Goal(expression=struck.new, may_fail=True)) == "done" else struck.old
-    )
+    outcome, reason = how_it_ended(run, Goal(expression=struck.new, may_fail=True))
+    came_to = struck.new if outcome == "done" else struck.old
     until(run.redundant, f"redundancy after {struck}")
     assert graph_of(run) == whole(came_to, placement, str(run.status()["leader"])), struck
     run.wait_for_answers(run.answered() + 1)
-    return came_to
+    run.heard()  # what is not read is dropped in the end
+    return came_to, NO_TIME not in reason
 
 
-def how_it_ended(run: Started, goal: Goal) -> str:
-    """`done`, `rolled back`, or `refused` where the Engine died before it had planned."""
+def how_it_ended(run: Started, goal: Goal) -> tuple[str, str]:
+    """`done`, `rolled back`, or `refused` where the Engine died before it had planned; and why."""
     try:
-        return str(adapt(run, goal)["outcome"])
+        found = adapt(run, goal, tries=1)
     except ConfigError as refusal:
         print(refusal)  # pytest shows it where a test fails
-        return "refused"
+        return "refused", str(refusal)
+    return str(found["outcome"]), str(found["reason"])
 
 
 def never_struck(outcome: Outcome) -> bool:
-    """Whether a replica was taken for hung, and a fault that never fired is all that is wrong."""
+    """Whether a replica was taken for hung, or an adaptation had no time, and a fault that never fired is all
+    that is wrong.
+    """
     reasons = outcome.verdict.reasons
     hung = any("hang" in text for text in outcome.told("alarm"))
-    return hung and bool(reasons) and all(one.startswith("faults_applied: never fired") for one in reasons)
+    busy = hung or any(NO_TIME in text for text in outcome.told("adapted"))
+    return busy and bool(reasons) and all(one.startswith("faults_applied: never fired") for one in reasons)
 
 
 def walk(home: Home, placement: str, todo: Iterable[Strike]) -> int:
     """Strike at each of `todo`, in runs of at most STRIKES_MAX; how many it survived. Prints the breaches.
 
     Nothing here hangs. Where an adaptation was refused for a replica that was taken for hung before the
-    strike, and nothing else is wrong, it is tried again in another run, FALSE_ALARMS_MAX times in all.
+    strike, or ended before it for want of time, and nothing else is wrong, it is tried again in another run,
+    FALSE_ALARMS_MAX times in all.
     """
     left: dict[str, list[Strike]] = {}
     false_alarms = 0
@@ -104,9 +112,10 @@ def walk(home: Home, placement: str, todo: Iterable[Strike]) -> int:
         done: list[Strike] = []
         with serving(home, at, placement) as run:
             try:
-                while len(done) < STRIKES_MAX and left.get(at):
+                had_time = True
+                while had_time and len(done) < STRIKES_MAX and left.get(at):
                     done.append(left[at].pop())
-                    at = strike(run, done[-1], placement)
+                    at, had_time = strike(run, done[-1], placement)
                 outcome = ended(run)
                 if false_alarms < FALSE_ALARMS_MAX and never_struck(outcome):
                     false_alarms += 1
@@ -145,7 +154,7 @@ def test_a_death_while_requests_are_let_on(home: Home, node: str, when: Event) -
 def test_an_engine_that_dies_takes_a_spare_that_the_adaptation_waits_for(home: Home) -> None:
     fault = Fault(Crash(), "engine", Trigger(Event.ADAPT_STEP_EXIT.label, 1))
     with serving(home, "pbr", "process", fault) as run:
-        assert how_it_ended(run, Goal(expression="pbr+tr")) == "done"
+        assert adapt(run, Goal(expression="pbr+tr"))["outcome"] == "done"
         assert_nothing_happened_to_requests(ended(run))
 
 
