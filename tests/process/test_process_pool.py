@@ -1,6 +1,5 @@
 """The supervisor's pool of processes, with real zygotes."""
 
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -116,8 +115,10 @@ def test_a_run_in_which_no_spare_comes_to_its_first_message_ends_with_the_reason
 def test_what_forks_the_spares_ends_with_its_zygote_also_where_it_is_stopped() -> None:
     command = [sys.executable, "-c", STOPPED]
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE) as zygote:
-        assert zygote.stdout is not None
-        intermediate = int(zygote.stdout.readline())
-        until(lambda: state_of(intermediate) == "T", "the intermediate to stop")
-        zygote.send_signal(signal.SIGKILL)
+        try:
+            assert zygote.stdout is not None
+            intermediate = int(zygote.stdout.readline())
+            until(lambda: state_of(intermediate) == "T", "the intermediate to stop")
+        finally:
+            zygote.kill()
     assert ended(intermediate)

@@ -85,13 +85,12 @@ def how_it_ended(run: Started, goal: Goal) -> tuple[str, str]:
     return str(found["outcome"]), str(found["reason"])
 
 
-def never_struck(outcome: Outcome) -> bool:
-    """Whether a replica was taken for hung, or an adaptation had no time, and a fault that never fired is all
-    that is wrong.
+def never_struck(outcome: Outcome, *, had_time: bool) -> bool:
+    """Whether the last adaptation had no time, or a replica was taken for hung, and a fault that never fired
+    is all that is wrong.
     """
     reasons = outcome.verdict.reasons
-    hung = any("hang" in text for text in outcome.told("alarm"))
-    busy = hung or any(NO_TIME in text for text in outcome.told("adapted"))
+    busy = not had_time or any("hang" in text for text in outcome.told("alarm"))
     return busy and bool(reasons) and all(one.startswith("faults_applied: never fired") for one in reasons)
 
 
@@ -117,7 +116,7 @@ def walk(home: Home, placement: str, todo: Iterable[Strike]) -> int:
                     done.append(left[at].pop())
                     at, had_time = strike(run, done[-1], placement)
                 outcome = ended(run)
-                if false_alarms < FALSE_ALARMS_MAX and never_struck(outcome):
+                if false_alarms < FALSE_ALARMS_MAX and never_struck(outcome, had_time=had_time):
                     false_alarms += 1
                     for struck in done:
                         left.setdefault(struck.old, []).append(struck)
