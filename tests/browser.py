@@ -133,7 +133,10 @@ def driven(folder: Path, width: int = 1280) -> Iterator[DrivenPage]:
     try:
         yield DrivenPage(sending, receiving)
     finally:
-        os.close(sending)
-        os.close(receiving)
-        process.kill()
-        process.wait()
+        os.close(sending)  # which ends it in order: one that is killed leaves a directory in /tmp
+        try:
+            process.wait(BROWSER_SECONDS_MAX)
+        finally:
+            process.kill()
+            process.wait()
+            os.close(receiving)
