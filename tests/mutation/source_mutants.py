@@ -372,6 +372,15 @@ MUTANTS: Final = (
         ("tests/process/test_process_pool.py",),
     ),
     SourceMutant(
+        "a supervisor takes time in which it was not let run for waiting",
+        "G7",
+        f"{UNIX}/supervisor.py",
+        "min(now_ns - self._looked_ns, LOOK_NS_MAX)",
+        "now_ns - self._looked_ns",
+        UNIT,
+        ("tests/runtime/test_drain.py",),
+    ),
+    SourceMutant(
         "a run that ends while an adaptation is observed has nothing under way",
         "G5",
         "aftbed/runtime/run_controller.py",

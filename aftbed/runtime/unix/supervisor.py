@@ -54,6 +54,7 @@ DRAIN_SECONDS: Final = 0.001  # between two checks of what is still under way
 LOOKS_MAX: Final = 80  # at states that differ: time for a follower on a busy machine
 LOOK_AGAIN_SECONDS: Final = 0.005  # at the states
 STOP_SECONDS_MAX: Final = 1.0
+LOOK_NS_MAX: Final = 20_000_000  # twenty times the pause between two looks
 HUB_SECONDS_MAX: Final = 0.2  # for its last frames, and to tell its clients
 
 
@@ -407,6 +408,7 @@ class Supervisor:
             if process is self._work.bus.hub and process.alive:
                 self._let_end(process)
             process.kill()
+        patience = Patience(STOP_SECONDS_MAX, time.monotonic_ns())
         while dying:
             before = len(dying)
             for process in list(dying):
@@ -414,7 +416,7 @@ class Supervisor:
                     process.close()
                     dying.remove(process)
             now_ns = time.monotonic_ns()
-            late = now_ns - began_ns > STOP_SECONDS_MAX * 1e9 and len(dying) == before
+            late = patience.ends(now_ns) and len(dying) == before
             if late and not any(starvation[p.pid].starves(now_ns) for p in dying):
                 break  # while some die, the rest may become ours to reap: a zygote's children
             time.sleep(0.001)  # no event to wait for: a killed process is a matter of a millisecond
@@ -422,6 +424,23 @@ class Supervisor:
         for one in starvation.values():
             one.close()
         return left
+
+
+class Patience:
+    """A wait of `seconds` by one look after the other.
+
+    Of the time between two looks `LOOK_NS_MAX` counts: a supervisor that the machine did not let run has not
+    waited meanwhile, and what it waits for may not have run either.
+    """
+
+    def __init__(self, seconds: float, now_ns: int) -> None:
+        self._left_ns, self._looked_ns = seconds * 1e9, now_ns
+
+    def ends(self, now_ns: int) -> bool:
+        """Whether this look is behind the end of the wait."""
+        self._left_ns -= min(now_ns - self._looked_ns, LOOK_NS_MAX)
+        self._looked_ns = now_ns
+        return self._left_ns < 0
 
 
 def drains_too_long(seconds: float, starved_s: float) -> bool:
