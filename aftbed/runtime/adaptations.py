@@ -126,6 +126,12 @@ class Adaptations:
         return self._current is not None
 
     @property
+    def preparing(self) -> bool:
+        """Whether new nodes are staged, which import and test what is the user's."""
+        now = self._current
+        return now is not None and now.phase is Phase.PREPARE and not now.ended
+
+    @property
     def delayed(self) -> bool:
         """Whether an adaptation was requested that waits for redundancy, and has not begun."""
         return self._delayed > 0

@@ -372,6 +372,15 @@ MUTANTS: Final = (
         ("tests/process/test_process_pool.py",),
     ),
     SourceMutant(
+        "the end of a run does not wait for an adaptation that is prepared",
+        "G8",
+        f"{UNIX}/supervisor.py",
+        "(max(since_ns) + self._prepared_ns) / 1e9",
+        "max(since_ns) / 1e9",
+        PROCESS,
+        ("tests/process/test_functions_outside.py",),
+    ),
+    SourceMutant(
         "a supervisor takes time in which it was not let run for waiting",
         "G7",
         f"{UNIX}/supervisor.py",

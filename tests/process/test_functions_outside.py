@@ -12,11 +12,21 @@ from typing import Final
 import pytest
 from liveruns import aftbed, home
 
+from aftbed.runtime.unix.supervisor import DRAIN_SECONDS_MAX
+
 pytestmark = pytest.mark.process
 
 __all__ = ["home"]
 
 MINE: Final = "from aftbed.vehicle.aeb.function import AebFunction\n\n\nclass Mine(AebFunction):\n    pass\n"
+SLOW_LIBRARY: Final = f"""import sys
+import time
+
+if "library" not in sys.modules:
+    sys.modules["library"] = time
+    time.sleep({DRAIN_SECONDS_MAX + 0.5})
+
+"""
 LOAD: Final = ("run", "--load", "60")
 
 
@@ -48,6 +58,14 @@ def test_a_file_that_was_run_is_known_to_its_user_and_to_no_other(
     judged = aftbed("check", record)
     assert judged.code == 3 and f"--trust {tmp_path}" in judged.out
     assert aftbed("check", record, "--trust", tmp_path).code == 0
+
+
+def test_a_function_whose_import_takes_longer_than_the_load_is_exchanged(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.py"
+    mine.write_text(SLOW_LIBRARY + MINE)
+    done = aftbed(*LOAD, "--adapt", f"update app to {mine}:Mine at request 9", "--json")
+    assert done.code == 0, done.out + done.err
+    assert [one["outcome"] for one in json.loads(done.out)["adaptations"]] == ["done"]
 
 
 def test_a_module_is_known_with_the_package_around_it(tmp_path: Path, ledger: Path) -> None:

@@ -49,7 +49,7 @@ BACKLOG_MAX: Final = {control.EVENT: 0.75, control.FINISHED: 1.0}
 COUNTS_SECONDS: Final = 0.2  # between two reports that differ in counts alone, at least
 LATE_NS_MAX: Final = 40_000_000  # of a look: beyond it the machine was too busy to judge what hangs
 DRAIN_SECONDS_MAX: Final = 2.0
-DRAIN_STARVED_SECONDS_MAX: Final = 10.0  # for which a process waited for a CPU meanwhile: not counted
+DRAIN_EXCUSED_SECONDS_MAX: Final = 10.0  # a process waited for a CPU, an adaptation was prepared: not counted
 DRAIN_SECONDS: Final = 0.001  # between two checks of what is still under way
 LOOKS_MAX: Final = 80  # at states that differ: time for a follower on a busy machine
 LOOK_AGAIN_SECONDS: Final = 0.005  # at the states
@@ -153,6 +153,7 @@ class Supervisor:
         self._reason: str | None = None
         self._unfinished: list[str] = []
         self._looks_left = LOOKS_MAX
+        self._drained_ns = self._prepared_ns = 0  # last look while the end is waited for; preparing meanwhile
         self._states: dict[str, str] = {}  # digests, by replica
 
         self._loop = EventLoop()
@@ -312,13 +313,19 @@ class Supervisor:
             return
         self._reason = reason
         self._loop.tasks.start("stop", self._work.stop_source(), lambda _: None)
-        self._drain(time.monotonic_ns(), self._waited_now_ns())
+        self._drained_ns = time.monotonic_ns()
+        self._drain(self._drained_ns, self._waited_now_ns())
 
     def _drain(self, began_ns: int, waited_ns: dict[int, int]) -> None:
         """Wait until all is answered, and what fails or changes has come to its end; or to the limit.
 
-        Of a service that is lost, neither is waited for. `waited_ns`: when this began at `began_ns`.
+        Of a service that is lost, neither is waited for. `waited_ns`: when this began at `began_ns`. At the
+        good end an adaptation is given the time to prepare itself: it imports what is the user's.
         """
+        now_ns = time.monotonic_ns()
+        if self._controller.adaptations.preparing and not self._reason:
+            self._prepared_ns += now_ns - self._drained_ns
+        self._drained_ns = now_ns
         unrest = self._work.awaits_replies or bool(self._controller.unrest())
         settled = self._work.ended and (self._lost or not unrest)
         command_gone = self._reason == COMMAND_GONE  # no process waits for a verdict
@@ -341,7 +348,7 @@ class Supervisor:
         if seconds <= DRAIN_SECONDS_MAX:
             return False
         since_ns = [now_ns - waited_ns.get(pid, 0) for pid, now_ns in self._waited_now_ns().items()]
-        return drains_too_long(seconds, max(since_ns) / 1e9)
+        return drains_too_long(seconds, (max(since_ns) + self._prepared_ns) / 1e9)
 
     def _waited_now_ns(self) -> dict[int, int]:
         """How long each process of the run has waited for a CPU so far, by pid; this one included."""
@@ -443,12 +450,13 @@ class Patience:
         return self._left_ns < 0
 
 
-def drains_too_long(seconds: float, starved_s: float) -> bool:
+def drains_too_long(seconds: float, excused_s: float) -> bool:
     """Whether the end is no longer waited for: after `DRAIN_SECONDS_MAX` in which all processes could run.
 
-    `starved_s`: for how long the one that waited longest was not let run in these `seconds`.
+    `excused_s`: for how long in these `seconds` the process that waited longest was not let run, and an
+    adaptation was being prepared.
     """
-    return seconds > DRAIN_SECONDS_MAX + min(starved_s, DRAIN_STARVED_SECONDS_MAX)
+    return seconds > DRAIN_SECONDS_MAX + min(excused_s, DRAIN_EXCUSED_SECONDS_MAX)
 
 
 def supervise(
