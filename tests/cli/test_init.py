@@ -185,7 +185,8 @@ def test_a_new_project_passes_its_own_tests(kind: str, here: Path) -> None:
     done = called(sys.executable, "-m", "pytest", "-q", *PLUGIN, "-W", "error", folder=folder)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "8 passed" in done.stdout
-    words = ("-m", "aftbed", "campaign", "run", "campaign.yaml", "--out", "out")
+    # Each experiment starts a program several times.
+    words = ("-m", "aftbed", "campaign", "run", "campaign.yaml", "--experiments", "5", "--out", "out")
     done = called(sys.executable, *words, folder=folder)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "gate: pass" in done.stdout
