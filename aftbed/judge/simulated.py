@@ -164,10 +164,10 @@ def needless_stops(run: Run) -> tuple[Breach, ...]:
         return ()
     stops = run.history.events(Event.DETECTED_STOP)
     if supervised(run):
-        if run.setup.faults or run.history.events(Event.WATCHDOG_SUSPECT):
-            return ()
-        # What was struck while the run went on makes late what comes behind it.
-        first_ns = min((one.t_ns for one in run.struck), default=None) if not run.setup.dooms else None
+        # What was struck or suspected makes late what comes behind it; the death of a Doom alone does not.
+        late = [one.t_ns for one in run.struck] if not run.setup.dooms else []
+        late += [record.t_ns for record in run.history.events(Event.FAULT_APPLIED, Event.WATCHDOG_SUSPECT)]
+        first_ns = min(late, default=None)
         stops = [stop for stop in stops if first_ns is None or stop.t_ns < first_ns]
     return tuple(Breach("needless_stop", f"{r.node} stopped at request {r.request_id}") for r in stops)
 

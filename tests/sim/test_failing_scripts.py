@@ -19,10 +19,10 @@ from aftbed.ftm.failover import failover
 from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Trigger
 from aftbed.inject.hang import Hang
-from aftbed.inject.model import Fault
+from aftbed.inject.model import Fault, parse
 from aftbed.judge.simulated import breaches, needless_stops
 from aftbed.runtime.sim.node_io import SimChannel
-from aftbed.runtime.sim.world import Setup, World
+from aftbed.runtime.sim.world import Run, Setup, World
 
 MS: Final = 1_000_000
 RATE_HZ: Final = 1000.0
@@ -178,8 +178,26 @@ def test_a_supervised_replica_may_stop_where_no_watchdog_is_left_to_suspect_it()
     world.end()
     run = world.outcome()
     assert breaches(run) == ()
+    assert run.struck and run.history.events(Event.FAULT_APPLIED)
+    assert [one.check for one in needless_stops(stopped_at_the_start(run))] == ["needless_stop"]
+
+
+def test_a_fault_excuses_no_stop_before_it_has_struck() -> None:
+    """Of a supervised run whose faults are those of its setup."""
+    fault = parse("slow primary by 20ms at before.exit nth 10")
+    world = World(Setup("lfr+sup", "process", 41532, 96, 500.0, faults=(fault,)))
+    world.start()
+    world.end()
+    run = world.outcome()
+    assert breaches(run) == ()
+    assert [one.check for one in needless_stops(stopped_at_the_start(run))] == ["needless_stop"]
+
+
+def stopped_at_the_start(run: Run) -> Run:
+    """The same run, whose only stop was before any strike."""
     (stop,) = run.history.events(Event.DETECTED_STOP)
-    assert run.struck
-    behind = tuple(one._replace(t_ns=stop.t_ns + 1) for one in run.struck)
-    found = needless_stops(replace(run, struck=behind))
-    assert [one.check for one in found] == ["needless_stop"], "a strike excuses what comes behind it only"
+    journals = {
+        name: [replace(one, t_ns=0) if one == stop else one for one in records]
+        for name, records in run.history.journals.items()
+    }
+    return replace(run, history=replace(run.history, journals=journals))
