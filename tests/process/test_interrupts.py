@@ -1,4 +1,5 @@
 """Ctrl-C in every long command: to all its processes, as a terminal does; to the command alone; and twice.
+And SIGTERM, to all, as timeout(1) does.
 
 A command is interrupted when its line of progress says that it is at work.
 """
@@ -59,7 +60,7 @@ COMMANDS: Final = (
     LongCommand("bench paper --quick", "bench paper"),
 )
 CONTROL: Final = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|\r")
-HOW: Final = ("to all", "to the command", "twice")
+HOW: Final = ("to all", "to the command", "twice", "by SIGTERM")
 
 
 class Interrupted:
@@ -109,7 +110,7 @@ class Interrupted:
         if how == "to the command":
             os.kill(self.process.pid, signal.SIGINT)
         else:
-            os.killpg(self.process.pid, signal.SIGINT)
+            os.killpg(self.process.pid, signal.SIGTERM if how == "by SIGTERM" else signal.SIGINT)
 
     def end(self) -> int:
         """Its exit code."""

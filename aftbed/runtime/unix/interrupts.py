@@ -1,4 +1,4 @@
-"""Ctrl-C: what must not be cut short by it, and whether it came.
+"""Ctrl-C: what must not be cut short by it, and whether it came. SIGTERM, as of timeout(1), is the same.
 
 An interrupt is a KeyboardInterrupt wherever the command is. A second one may come while the command cleans up
 behind the first: what removes files or starts processes is done in `uninterrupted`. So are the large imports:
@@ -19,6 +19,7 @@ def listen() -> None:
     """Count the interrupts of this process; where they are ignored, as behind `&`, they stay so."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
+        signal.signal(signal.SIGTERM, lambda number, frame: signal.raise_signal(signal.SIGINT))
 
 
 def ignore() -> None:
