@@ -4,6 +4,7 @@ And SIGTERM, to all, as timeout(1) does.
 A command is interrupted when its line of progress says that it is at work.
 """
 
+import json
 import os
 import pty
 import re
@@ -15,7 +16,7 @@ from typing import Final, NamedTuple, Self
 
 import pytest
 from homes import WAIT_SECONDS_MAX, Home, home, until
-from liveruns import readable
+from liveruns import called, readable
 from sampling import every
 
 from aftbed.cli.interrupted import EXIT_INTERRUPTED
@@ -169,6 +170,24 @@ def test_what_an_interrupted_campaign_says_goes_on(home: Home, tmp_path: Path) -
     )
     assert done.returncode in (0, 1), done.stderr
     assert "records and reports: kept" in done.stdout
+
+
+def test_a_node_can_be_killed_by_hand(home: Home) -> None:
+    """SIGTERM, as of kill(1), is heeded by the command alone as an interrupt."""
+    line = [sys.executable, "-m", "aftbed", "run", "--load", "2000@500", "--json"]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as command:
+        pids: dict[str, int] = {}
+        until(lambda: pids.update(nodes()) or "a/server" in pids, "a run")
+        os.kill(pids["a/server"], signal.SIGTERM)
+        out, _ = command.communicate(timeout=WAIT_SECONDS_MAX)
+    found = json.loads(out)
+    assert (found["verdict"], len(found["failovers"])) == ("pass", 1), found
+
+
+def nodes() -> dict[str, int]:
+    """The pids of the nodes of the live run, by name; none before there is one."""
+    done = called("ps", "--json")
+    return {row["name"]: row["pid"] for row in json.loads(done.out)} if done.code == 0 else {}
 
 
 # A command that is interrupted where it imports a module, or where a class of it names a property.

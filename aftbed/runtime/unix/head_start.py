@@ -82,7 +82,7 @@ def end() -> None:
 
 def _supervise(line: socket.socket, has_bus: bool) -> NoReturn:
     os.setsid()  # a terminal's Ctrl-C reaches the command alone
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    interrupts.ignore()
     from aftbed.runtime.unix.supervisor_process import begin_early  # noqa: PLC0415 - in the child
 
     begin_early(line, has_bus=has_bus)

@@ -23,8 +23,12 @@ def listen() -> None:
 
 
 def ignore() -> None:
-    """From now on; for a process that is about to end."""
+    """From now on; for a process that is about to end, or that leaves interrupts to the command.
+
+    SIGTERM ends it, so that a node can be killed by hand.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def came() -> bool:

@@ -26,7 +26,7 @@ import msgspec
 from aftbed.core.errors import AftbedError, HarnessError
 from aftbed.runtime import control
 from aftbed.runtime.interface import BUS, LIGHT
-from aftbed.runtime.unix import linux, run_directory
+from aftbed.runtime.unix import interrupts, linux, run_directory
 from aftbed.runtime.unix.cleanup import UndoLedger
 from aftbed.runtime.unix.options import LoadRun, RunOptions
 from aftbed.runtime.unix.process_pool import Started, start_zygote
@@ -94,7 +94,7 @@ def be_supervisor(owner: socket.socket, zygotes: dict[str, Started]) -> NoReturn
         if handed_over != RUN:
             _end(zygotes)
             os._exit(code)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        interrupts.ignore()
         options, _life, waker = _decode(read_file(fds[0])), *fds[1:3]  # the life is kept open, no more
         listener, log, *_ = *fds[3:], -1, -1
         options = msgspec.structs.replace(options, listener=listener, log=log)

@@ -283,7 +283,7 @@ def _work(command: int, pipe: socket.socket, judge: Judge | None = None) -> NoRe
     are left to the command.
     """
     try:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        interrupts.ignore()
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         linux.die_with(command)
         if judge is None:
