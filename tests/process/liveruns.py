@@ -26,6 +26,7 @@ import command_process
 import msgspec
 import psutil
 import pytest
+import typer  # noqa: F401 - without it `main` takes this interpreter for a command's, and ignores Ctrl-C at its end
 from homes import (
     FORKED,
     GONE_SECONDS_MAX,

@@ -1,5 +1,5 @@
 """Ctrl-C in every long command: to all its processes, as a terminal does; to the command alone; and twice.
-And SIGTERM, to all, as timeout(1) does.
+And SIGTERM: to all, as timeout(1) does; to a command behind `&` in a script, where Ctrl-C is ignored.
 
 A command is interrupted when its line of progress says that it is at work.
 """
@@ -61,19 +61,21 @@ COMMANDS: Final = (
     LongCommand("bench paper --quick", "bench paper"),
 )
 CONTROL: Final = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|\r")
-HOW: Final = ("to all", "to the command", "twice", "by SIGTERM")
+HOW: Final = ("to all", "to the command", "twice", "by SIGTERM", "in the background")
+BEHIND: Final = ("sh", "-c", 'trap "" INT; exec "$@"', "sh")
 
 
 class Interrupted:
     """A command with its errors on a terminal, in a directory of its own, also for temporary files."""
 
-    def __init__(self, words: str, folder: Path) -> None:
+    def __init__(self, words: str, folder: Path, how: str = "to the command") -> None:
+        self.how = how
         self.folder, self.temporary = folder / "work", folder / "tmp"
         self.folder.mkdir()
         self.temporary.mkdir()
         self._terminal, theirs = pty.openpty()
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "aftbed", *words.split()],
+            [*(BEHIND if how == "in the background" else ()), sys.executable, "-m", "aftbed", *words.split()],
             stdout=subprocess.DEVNULL,
             stderr=theirs,
             start_new_session=True,
@@ -107,11 +109,16 @@ class Interrupted:
         self.errors += data.decode()
         return bool(data)
 
-    def interrupt(self, how: str) -> None:
-        if how == "to the command":
-            os.kill(self.process.pid, signal.SIGINT)
-        else:
-            os.killpg(self.process.pid, signal.SIGTERM if how == "by SIGTERM" else signal.SIGINT)
+    def interrupt(self) -> None:
+        match self.how:
+            case "to the command":
+                os.kill(self.process.pid, signal.SIGINT)
+            case "in the background":
+                os.kill(self.process.pid, signal.SIGTERM)
+            case "by SIGTERM":
+                os.killpg(self.process.pid, signal.SIGTERM)
+            case _:
+                os.killpg(self.process.pid, signal.SIGINT)
 
     def end(self) -> int:
         """Its exit code."""
@@ -137,11 +144,11 @@ CASES: Final = [(command, how) for how in HOW for command in COMMANDS]
 def test_it_ends_with_130_and_leaves_nothing(
     home: Home, tmp_path: Path, command: LongCommand, how: str
 ) -> None:
-    with Interrupted(command.words, tmp_path) as began:
+    with Interrupted(command.words, tmp_path, how) as began:
         began.wait_for(command.begun)
-        began.interrupt(how)
+        began.interrupt()
         if how == "twice" and began.says_more():  # its line is erased: it cleans up
-            began.interrupt(how)
+            began.interrupt()
         code, lines = began.end(), began.lines()
     assert code == EXIT_INTERRUPTED, began.errors
     assert not any("Traceback" in line or "Exception" in line for line in lines), began.errors
@@ -157,7 +164,7 @@ def test_what_an_interrupted_campaign_says_goes_on(home: Home, tmp_path: Path) -
     words = "campaign run bitflip --runtime sim --experiments 4 --out kept --jobs 1"
     with Interrupted(words, tmp_path) as began:
         began.wait_for(" of ")
-        began.interrupt("to the command")
+        began.interrupt()
         assert began.end() == EXIT_INTERRUPTED
     last = began.lines()[-2]
     go_on = last.partition("go on: aftbed ")[2].partition(";")[0]

@@ -11,15 +11,18 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
+from typing import Final
 
+ENDS: Final = (signal.SIGINT, signal.SIGTERM)
 _came: list[int] = []
 
 
 def listen() -> None:
-    """Count the interrupts of this process; where they are ignored, as behind `&`, they stay so."""
+    """Count the interrupts of this process; where Ctrl-C is ignored, as behind `&`, it stays so."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
-        signal.signal(signal.SIGTERM, lambda number, frame: signal.raise_signal(signal.SIGINT))
+    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, _interrupt)
 
 
 def ignore() -> None:
@@ -45,13 +48,14 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 def uninterrupted() -> Iterator[None]:
     """An interrupt is raised only after it; a process that is started in it receives none, then or later.
 
-    The mask is for this thread and for that process. The handler is for interrupts that the kernel gives to
-    another thread of this process (libraries have some): Python would raise them here all the same.
+    The mask is for this thread and for that process, which SIGTERM still ends. The handlers are for SIGTERM,
+    and for interrupts that the kernel gives to another thread of this process (libraries have some): Python
+    would raise them here all the same.
     """
     came: list[int] = []
     command = os.getpid()
     try:
-        handler = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+        before = {s: signal.signal(s, lambda number, _: came.append(number)) for s in ENDS}
     except ValueError:  # not the main thread: interrupts are not for it
         yield
         return
@@ -64,9 +68,10 @@ def uninterrupted() -> Iterator[None]:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         else:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-            signal.signal(signal.SIGINT, handler)
+            for number, handler in before.items():
+                signal.signal(number, handler)
             if came:
-                signal.raise_signal(signal.SIGINT)
+                signal.raise_signal(came[0])
 
 
 def fork() -> int:
