@@ -28,7 +28,7 @@ from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.core.units import duration
 from aftbed.ftm.compose import build, detects
-from aftbed.functions.load import NO_CODE, OWN_CODE, Code
+from aftbed.functions.load import NO_CODE, OWN_CODE, Code, preload_for
 from aftbed.functions.request_file import GivenRequests, names_function, requests_from
 from aftbed.inject.model import Fault, FaultReport, parse
 from aftbed.judge.asked import WITHOUT_END
@@ -383,6 +383,7 @@ def _recorded(experiment: Experiment, standing: ExitStack) -> RunRecord:
         application=experiment.app,
         ftti_ms=experiment.ftti_ms,
     )
+    preload_for(experiment.app)
     warm_up(BUS if experiment.scenario else LIGHT)
     launched = launch(options, listener, given)
     standing.callback(launched.remove)

@@ -180,7 +180,7 @@ class FmuApplication:
         with self._failing("its state cannot be restored"):
             try:
                 prepared = self._model.prepare(state[_STATE.size :])
-            except _fmpy().fmi1.FMICallException as error:
+            except import_fmpy().fmi1.FMICallException as error:
                 raise PeerError(f"the model refuses the state: {error}{_LOG.text()}") from error
             self._model.load(prepared)
         self._time_s, self._time_before = time_s, before
@@ -215,7 +215,7 @@ def _by_type(variables: Sequence[Variable]) -> list[tuple[str, list[int], list[i
 
 
 @cache
-def _fmpy() -> Any:
+def import_fmpy() -> Any:
     """The package. Raises ConfigError.
 
     It prints what it misses, and numpy, which it brings, starts a thread for each core.
@@ -262,7 +262,7 @@ def _callbacks() -> Any:
     """Of FMI 2. They live as long as the process: FMPy's proxy, which formats messages, points to them."""
     import ctypes  # noqa: PLC0415 - with FMPy
 
-    fmi2 = _fmpy().fmi2
+    fmi2 = import_fmpy().fmi2
     found = fmi2.fmi2CallbackFunctions()
     found.logger = fmi2.fmi2CallbackLoggerTYPE(
         lambda _env, _name, status, _category, text: _LOG.add(status, text)
@@ -308,7 +308,7 @@ class _Access:
 
 class _Fmi2(_Access):
     def __init__(self, names: dict[str, str]) -> None:
-        super().__init__(_fmpy().fmi2.FMU2Slave(**names))
+        super().__init__(import_fmpy().fmi2.FMU2Slave(**names))
         self._instance.instantiate(callbacks=_callbacks(), loggingOn=True)
 
     def initialise(self) -> None:
@@ -340,7 +340,7 @@ class _Fmi2(_Access):
 
 class _Fmi3(_Access):
     def __init__(self, names: dict[str, str]) -> None:
-        super().__init__(_fmpy().fmi3.FMU3Slave(**names))
+        super().__init__(import_fmpy().fmi3.FMU3Slave(**names))
         self._instance.instantiate(
             loggingOn=True, logMessage=lambda _environment, status, _category, text: _LOG.add(status, text)
         )
@@ -419,7 +419,7 @@ def _described(model: Path) -> Description:
             if name in names and (size := archive.getinfo(name).file_size) > DESCRIPTION_BYTES_MAX:
                 raise ConfigError(f"{model}: {name}: found {size} bytes, allowed are {DESCRIPTION_BYTES_MAX}")
         version = _version(model, archive)
-        fmpy = _fmpy()
+        fmpy = import_fmpy()
         try:
             found = fmpy.read_model_description(file)
         except Exception as error:  # whatever FMPy thinks of it

@@ -1,5 +1,6 @@
 """Loads a protected function, in the process that will host it, never in one that serves."""
 
+import contextlib
 import importlib
 import importlib.util
 import traceback
@@ -117,6 +118,18 @@ def load_application(source: str, code: Code) -> Callable[[], Application]:
             return fmu_function(Path(named.place), Path(named.part))
         case _:
             assert_never(named.kind)
+
+
+def preload_for(source: str) -> None:
+    """Import what a function of the kind of `source` needs, and nothing of the user's: all forks have it.
+
+    Where it is missing, a process that hosts such a function will say so.
+    """
+    with contextlib.suppress(ConfigError):
+        if source and parse_source(source).kind is FunctionKind.MODEL:
+            from aftbed.functions.fmu import import_fmpy  # noqa: PLC0415 - an extra, and 0.3 s
+
+            import_fmpy()
 
 
 def characteristics_of(source: str, code: Code) -> Characteristics:

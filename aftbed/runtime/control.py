@@ -63,10 +63,12 @@ class ControlOrder(msgspec.Struct, frozen=True, tag=True):
 class Park(ControlOrder, frozen=True):
     """To a zygote: fork one spare for each descriptor that came along.
 
-    `mechanisms`: those of installed packages, which it imports before.
+    Before, it imports `mechanisms`, those of installed packages, and what functions of the kind of
+    `application` need.
     """
 
     mechanisms: tuple[str, ...] = ()
+    application: str = ""
 
 
 class JoinRun(ControlOrder, frozen=True):

@@ -554,7 +554,7 @@ def test_without_fmpy_the_extra_is_named(
     build: Build, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = build()
-    fmu._fmpy.cache_clear()
+    fmu.import_fmpy.cache_clear()
     monkeypatch.setitem(sys.modules, "fmpy.fmi2", None)
     with pytest.raises(ConfigError, match=r'an FMU needs FMPy \(.*\): pip install "aftbed\[fmi\]"'):
         fmu_function(model, tmp_path / "ports.yaml")

@@ -42,11 +42,16 @@ class Full:
 linux.become_subreaper()
 loop = EventLoop()
 ledger = UndoLedger(Path(sys.argv[1]), os.eventfd(0))
-pool = UnixProcessPool(loop, lambda process, report: None, restart, ledger)
+pool = UnixProcessPool(loop, lambda process, report: None, restart, ledger, sys.argv[2])
 pool.start_zygote(LIGHT)
 {{what}}
 loop.tasks.start("spares", pool.parked_at_least(LIGHT, {OWED}), end)
 loop.run()
+spares = [process.pid for process in pool.processes if process.kind is ProcessKind.SPARE]
+print(sum("/numpy/" in Path("/proc/%d/maps" % pid).read_text() for pid in spares), "with numpy")
+"""
+PARK: Final = f"""
+pool.park(LIGHT, {OWED})
 """
 DEAD: Final = f"""
 os.kill(pool.zygotes[LIGHT].pid, signal.SIGSTOP)  # it reads none of its orders
@@ -87,9 +92,9 @@ zygote._fork_spares([os.dup(0)], os.getpid())
 """
 
 
-def supervise(what: str, folder: Path) -> subprocess.CompletedProcess[str]:
+def supervise(what: str, folder: Path, application: str = "") -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-c", SUPERVISOR.format(what=what), folder],
+        [sys.executable, "-c", SUPERVISOR.format(what=what), folder, application],
         capture_output=True,
         text=True,
         timeout=SECONDS_MAX,
@@ -101,7 +106,14 @@ def supervise(what: str, folder: Path) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize("what", [DEAD, UNREAD], ids=["of a dead zygote", "of an order that was not sent"])
 def test_all_spares_that_were_ordered_are_parked_in_the_end(tmp_path: Path, what: str) -> None:
     done = supervise(what, tmp_path)
-    assert done.stdout == "all parked\n", done.stderr
+    assert done.stdout == "all parked\n0 with numpy\n", done.stderr
+
+
+@pytest.mark.process
+def test_the_spares_of_a_run_with_an_fmu_have_what_it_needs(tmp_path: Path) -> None:
+    """To import it takes a new backup 0.2 s, in which there is no redundancy."""
+    done = supervise(PARK, tmp_path, "model.fmu")
+    assert done.stdout == f"all parked\n{OWED} with numpy\n", done.stderr
 
 
 @pytest.mark.process

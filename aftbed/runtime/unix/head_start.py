@@ -23,6 +23,7 @@ from aftbed.runtime.unix import interrupts
 
 END_SECONDS_MAX: Final = 0.8  # G7 allows 1 s
 WORDS_WITHOUT_BUS: Final = ("--load", "--requests")
+MODEL_SUFFIX: Final = ".fmu"  # of a function for which there is much to import
 _begun: Final[list["Start"]] = []  # at most one
 
 
@@ -65,8 +66,9 @@ def begin(words: Sequence[str]) -> None:
     if "--help" in words:
         return
     has_bus = not any(word.startswith(WORDS_WITHOUT_BUS) for word in words)
+    model = next((word for word in words if MODEL_SUFFIX in word), "")
     with suppress(OSError):  # then the launch says so
-        _begun.append(fork(lambda line: _supervise(line, has_bus)))
+        _begun.append(fork(lambda line: _supervise(line, has_bus, model)))
 
 
 def taken() -> Start | None:
@@ -80,9 +82,9 @@ def end() -> None:
         start.end()
 
 
-def _supervise(line: socket.socket, has_bus: bool) -> NoReturn:
+def _supervise(line: socket.socket, has_bus: bool, model: str) -> NoReturn:
     os.setsid()  # a terminal's Ctrl-C reaches the command alone
     interrupts.ignore()
     from aftbed.runtime.unix.supervisor_process import begin_early  # noqa: PLC0415 - in the child
 
-    begin_early(line, has_bus=has_bus)
+    begin_early(line, has_bus=has_bus, application=model)

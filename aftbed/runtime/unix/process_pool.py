@@ -148,7 +148,9 @@ class UnixProcess:
 
 
 class UnixProcessPool:
-    """See `runtime.interface.ProcessPool`. `on_report` and `on_death` are the supervisor's."""
+    """See `runtime.interface.ProcessPool`. `on_report` and `on_death` are the supervisor's; `application`:
+    the protected function.
+    """
 
     def __init__(
         self,
@@ -156,8 +158,9 @@ class UnixProcessPool:
         on_report: Callable[[UnixProcess, msgspec.Struct], None],
         on_death: Callable[[UnixProcess], None],
         ledger: UndoLedger,
+        application: str,
     ) -> None:
-        self._loop, self._ledger = loop, ledger
+        self._loop, self._ledger, self._application = loop, ledger, application
         self._cpus = sorted(os.sched_getaffinity(0))
         self._on_report, self._on_death = on_report, on_death
         self.processes: list[UnixProcess] = []
@@ -194,7 +197,8 @@ class UnixProcessPool:
             ]
             self._unborn[zygote] += [self._add("spare", ProcessKind.SPARE, ours) for ours, _ in pairs]
             with contextlib.suppress(OSError):  # a dead zygote: its restart orders them again
-                order = control.Park(0, installed_mechanisms() if zygote == LIGHT else ())
+                imports = (installed_mechanisms(), self._application) if zygote == LIGHT else ()
+                order = control.Park(0, *imports)
                 self.zygotes[zygote].line.send(order, tuple(end.fileno() for _, end in pairs))
             for _, theirs in pairs:
                 theirs.close()

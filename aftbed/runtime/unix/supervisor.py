@@ -157,7 +157,7 @@ class Supervisor:
         self._states: dict[str, str] = {}  # digests, by replica
 
         self._loop = EventLoop()
-        self.pool = UnixProcessPool(self._loop, self._on_report, self._on_death, ledger)
+        self.pool = UnixProcessPool(self._loop, self._on_report, self._on_death, ledger, options.application)
         self._work = Workload(
             options, self.pool, self._loop, self._log, self._finish, self._report_owner, self._report_state
         )

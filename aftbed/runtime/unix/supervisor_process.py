@@ -57,10 +57,11 @@ def warm_up(name: str) -> None:
         _WARM.add(name)
 
 
-def begin_early(owner: socket.socket, *, has_bus: bool) -> NoReturn:
+def begin_early(owner: socket.socket, *, has_bus: bool, application: str) -> NoReturn:
     """Fork zygotes, then be the supervisor. Called in a process that has imported next to nothing.
 
-    `has_bus`: whether the run has one, as far as can be told; if it has one all the same, that costs time.
+    `has_bus`: whether the run has one, and `application`: its function, as far as can be told; if it has
+    another one, that costs time.
     """
     gc.disable()  # what is imported stays
     linux.continue_at_parents_death()
@@ -74,7 +75,7 @@ def begin_early(owner: socket.socket, *, has_bus: bool) -> NoReturn:
         if has_bus:  # it has more to import
             zygotes[BUS] = zygote.fork(BUS, cpus)
         rehearsal.rehearse()
-        zygotes[LIGHT] = zygote.fork(LIGHT, cpus)
+        zygotes[LIGHT] = zygote.fork(LIGHT, cpus, application)
     from aftbed.runtime.unix import supervisor  # noqa: PLC0415 - the zygotes have less to copy without it
 
     assert supervisor

@@ -26,7 +26,7 @@ import msgspec
 from aftbed.core.errors import ConfigError, FunctionFailedError
 from aftbed.ftm.client import Client
 from aftbed.ftm.registry import find
-from aftbed.functions.load import Code, load_module
+from aftbed.functions.load import Code, load_module, preload_for
 from aftbed.functions.source import FunctionSource
 from aftbed.runtime import control
 from aftbed.runtime.assembly import Assembler
@@ -44,11 +44,13 @@ from aftbed.runtime.unix.transport import ORDER_SECONDS, WRITE_SECONDS_MAX, Line
 from aftbed.vehicle.aeb.function import default_application
 
 
-def fork(name: str, cpus: list[int], *, warm: bool = False) -> tuple[int, socket.socket]:
+def fork(
+    name: str, cpus: list[int], application: str = "", *, warm: bool = False
+) -> tuple[int, socket.socket]:
     """Fork the zygote `name` from this process: its pid, and our end of its control line.
 
-    That of the mechanism is forked from a process that has rehearsed. `warm`: this process has imported what
-    the zygote needs, and its memory is settled. Raises OSError.
+    That of the mechanism is forked from a process that has rehearsed. `application`: what to import for, if
+    known. `warm`: this process has imported what the zygote needs, and its memory is settled. Raises OSError.
     """
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     supervisor = os.getpid()
@@ -63,6 +65,7 @@ def fork(name: str, cpus: list[int], *, warm: bool = False) -> tuple[int, socket
                 _begin(supervisor, cpus)
                 if not warm:
                     preload(name)
+                    preload_for(application)
                     if name == LIGHT:
                         rehearsal.settle()
                 _serve(supervisor, rehearsed=warm or name == LIGHT)
@@ -114,6 +117,7 @@ def _serve(supervisor: int, *, rehearsed: bool) -> NoReturn:
         for name in order.mechanisms:
             with contextlib.suppress(ConfigError):  # a node that needs it will say so
                 find(name)
+        preload_for(order.application)
         try:
             _fork_spares(fds, supervisor)
         except OSError as error:
