@@ -123,9 +123,9 @@ def load_application(source: str, code: Code) -> Callable[[], Application]:
 def preload_for(source: str) -> None:
     """Import what a function of the kind of `source` needs, and nothing of the user's: all forks have it.
 
-    Where it is missing, a process that hosts such a function will say so.
+    Where that fails, a process that hosts such a function will say so.
     """
-    with contextlib.suppress(ConfigError):
+    with contextlib.suppress(ConfigError, OSError):  # OSError: a text that is too long for the name of a file
         if source and parse_source(source).kind is FunctionKind.MODEL:
             from aftbed.functions.fmu import import_fmpy  # noqa: PLC0415 - an extra, and 0.3 s
 
