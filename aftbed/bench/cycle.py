@@ -4,7 +4,13 @@
 mechanism, over the same kind of sockets, under the same scheduling policy and pinned alike, in the same
 language, but with a plain read and a plain write per hop, without bricks, decoding or journal. Where the
 leader sends to its backup (a checkpoint under `pbr`), the ring's process in its place first writes a packet
-to a process on the backup's core, which reads and drops it. Cycle and ring are measured in turn (`rounds`).
+to a process on the backup's core, which reads and drops it.
+
+**Turns.** In each round a run and a ring live side by side, and take turns of `TURN_NS` by the monotonic
+clock: the load sends only in its turns, the ring turns in the others. So a machine that is slower for a tenth
+of a second is slower for both. What began in the first `SETTLE_NS` of a turn, with caches that the other side
+has filled, is left out, and so is what did not end in its turn. A function of the user may take longer than a
+turn: its cycle and the ring are measured one behind the other (`rounds.in_turn`).
 
 **Hop.** `bench_hops` reads the delay of one hop, as a distribution, from the journals of a run. All notes
 of a step carry the time at which the step began, on a clock common to all nodes. So the time between the
@@ -35,12 +41,15 @@ follow by the same rules from the path of its requests; a brick that notes the s
 Limits: other work on the machine is in the upper quantiles. The journal's writes are part of a hop.
 """
 
+import contextlib
 import itertools
 import os
 import socket
 import time
+from array import array
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -51,14 +60,25 @@ from aftbed.bench.rounds import (
     InRounds,
     MachineWatch,
     Meanwhile,
+    Rounds,
     as_node,
     become_node,
     beside_limit,
     cores,
     in_turn,
     shares,
+    together,
 )
-from aftbed.bench.runs import Percentiles, latencies_us, limited_run, percentiles
+from aftbed.bench.runs import (
+    Percentiles,
+    TimedSample,
+    answered,
+    endless_run,
+    latencies_us,
+    limited_run,
+    percentiles,
+    wait_until_ready,
+)
 from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import HarnessError
 from aftbed.core.events import Event
@@ -71,13 +91,20 @@ from aftbed.functions.request_file import GivenRequests
 from aftbed.functions.source import is_foreign
 from aftbed.judge.record import RunRecord
 from aftbed.runtime.unix import interrupts, linux
+from aftbed.runtime.unix.options import Turns
 from aftbed.vehicle.aeb.function import sample_requests
 
+CYCLE_ROUNDS: Final = 2 * ROUNDS  # the ratios of two runs differ more than those of two turns
 WARM_UP: Final = 200  # requests, and turns of the ring
 RING_BYTES, RING_COUNT = 64, 300  # a packet and the turns of `ring_p50_us`
 READ_BYTES_MAX: Final = 4096
-TURN_SECONDS_MAX: Final = 10.0  # of the ring
+TURN_SECONDS_MAX: Final = 10.0  # of a packet through the ring
 assert READ_BYTES_MAX <= PACKET_BYTES_MAX
+
+TURN_NS: Final = 10_000_000  # some 80 cycles, and much less than what is taken for a hang
+SETTLE_NS: Final = 1_000_000  # of a turn
+OURS, THEIRS = Turns(TURN_NS, 0), Turns(TURN_NS, 1)
+SENT_MORE: Final = 100  # requests, and half as many as are wanted: for those that are left out
 
 # -- cycle ------------------------------------------------------------------------------------------
 
@@ -109,29 +136,73 @@ class CycleRun(NamedTuple):
 
     def cycles_us(self, count: int) -> list[float]:
         """The cycles of `count` requests (us), after a warm-up. Raises HarnessError."""
-        run = limited_run(
+        return latencies_us(self._record(count + WARM_UP), skip=WARM_UP)
+
+    def cycles_beside(
+        self, count: int, other: AbstractContextManager[list[TimedSample]]
+    ) -> tuple[list[float], list[float]]:
+        """The first `count` cycles that `settled` leaves, after a warm-up, and what `other` measured in the
+        turns between those of the load (us). `other` measures within the context, its list is full behind it.
+
+        The latter are none where it was not let run at all. Raises HarnessError.
+        """
+        with other as measured:
+            record = self._record(WARM_UP + count + count // 2 + SENT_MORE, OURS)
+        cycles = answered(record)
+        began_ns, ended_ns = cycles[0].began_ns, cycles[-1].began_ns
+        beside = settled((one for one in measured if began_ns <= one.began_ns <= ended_ns), THEIRS, 1)
+        ours = settled(cycles[WARM_UP:], OURS, count)[:count]
+        return [one.us for one in ours], [one.us for one in beside]
+
+    @contextlib.contextmanager
+    def in_their_turns(self) -> Iterator[list[TimedSample]]:
+        """Measure without an end: the other side of `cycles_beside`. Raises HarnessError."""
+        found: list[TimedSample] = []
+        with endless_run(self.ftm, self.placement, pin=self.pin, turns=THEIRS) as run:
+            wait_until_ready(run.private)
+            yield found
+        found += answered(run.record, skip=WARM_UP)
+
+    def _record(self, count: int, turns: Turns | None = None) -> RunRecord:
+        return limited_run(
             self.ftm,
             self.placement,
-            count + WARM_UP,
+            count,
             pin=self.pin,
             application=self.application,
             given=self.given,
+            turns=turns,
         )
-        return latencies_us(run, skip=WARM_UP)
 
 
-def bench_cycle(ours: CycleRun, count: int, *, rounds: int = ROUNDS, show: Show = unshown) -> CycleResult:
+def settled(measured: Iterable[TimedSample], turns: Turns, least: int) -> list[TimedSample]:
+    """Those that began in one of `turns`, behind its first `SETTLE_NS`, and ended within it.
+
+    All, if these are fewer than `least`: on a machine so busy hardly anything ends within a turn.
+    """
+    everything = list(measured)
+    found = [
+        one
+        for one in everything
+        if not turns.left_ns(one.began_ns) and SETTLE_NS <= one.began_ns % turns.ns < turns.ns - one.us * 1e3
+    ]
+    return found if len(found) >= least else everything
+
+
+def bench_cycle(
+    ours: CycleRun, count: int, *, rounds: int = CYCLE_ROUNDS, show: Show = unshown
+) -> CycleResult:
     """`count` requests in rounds, in turn with the ring."""
     shape = ring_of(build(ours.ftm, ours.placement))
     fixed = is_foreign(ours.application)
     sent = ours.given.requests if ours.given is not None else sample_requests(0, 64, fixed=fixed)
     size = sum(map(len, sent)) // len(sent)
-    share = shares(count, rounds)
-    found = in_turn(
-        len(share),
-        lambda number: ours.cycles_us(share[number]),
-        lambda number: ring_us(shape, size, share[number], pin=ours.pin),
-        show=show,
+    found = _in_rounds(
+        ours,
+        shares(count, rounds),
+        partial(ring_in_their_turns, shape, size, pin=ours.pin),
+        partial(ring_us, shape, size, pin=ours.pin),
+        show,
     )
     cycles, ring = ([us for one in values for us in one] for values in (found.figures, found.limits))
     beside = beside_limit(shape.name, found.figures, found.limits, 1)
@@ -154,6 +225,24 @@ def bench_cycle(ours: CycleRun, count: int, *, rounds: int = ROUNDS, show: Show 
     )
 
 
+def _in_rounds(
+    ours: CycleRun,
+    share: list[int],
+    in_their_turns: Callable[[], AbstractContextManager[list[TimedSample]]],
+    limit_us: Callable[[int], list[float]],
+    show: Show,
+) -> Rounds[list[float], list[float]]:
+    """The cycles of `ours` and their limit: side by side, or what a user gives and `limit_us`, in turn."""
+    if ours.application or ours.given is not None:
+        return in_turn(
+            len(share),
+            lambda number: ours.cycles_us(share[number]),
+            lambda number: limit_us(share[number]),
+            show=show,
+        )
+    return together(len(share), lambda number: ours.cycles_beside(share[number], in_their_turns()), show)
+
+
 class CycleBesideResult(InRounds, frozen=True):
     """The document of `aftbed bench cycle --beside`, whose limit is a cycle, too."""
 
@@ -166,18 +255,12 @@ class CycleBesideResult(InRounds, frozen=True):
 
 
 def bench_cycle_beside(
-    ours: CycleRun, other: CycleRun, count: int, *, rounds: int = ROUNDS, show: Show = unshown
+    ours: CycleRun, other: CycleRun, count: int, *, rounds: int = CYCLE_ROUNDS, show: Show = unshown
 ) -> CycleBesideResult:
     """`count` requests in rounds, in turn with as many of `other`."""
     for side in (ours, other):
         build(side.ftm, side.placement)  # refuses what there is none of, before anything is measured
-    share = shares(count, rounds)
-    found = in_turn(
-        len(share),
-        lambda number: ours.cycles_us(share[number]),
-        lambda number: other.cycles_us(share[number]),
-        show=show,
-    )
+    found = _in_rounds(ours, shares(count, rounds), other.in_their_turns, other.cycles_us, show)
     name = f"cycle under {other.ftm}, {other.placement}"
     beside = beside_limit(name, found.figures, found.limits, 1)
     cycles = list(itertools.chain.from_iterable(found.figures))
@@ -260,6 +343,55 @@ def ring_us(
 
     Raises HarnessError if a packet does not come back.
     """
+    with _ring(shape, packet_bytes, pin=pin, work=work) as turn_us, as_node(cores(pin=pin)[0]):
+        times = [turn_us() for _ in range(warm_up + count)]
+    return times[warm_up:]
+
+
+@contextlib.contextmanager
+def ring_in_their_turns(shape: RingShape, packet_bytes: int, *, pin: bool) -> Iterator[list[TimedSample]]:
+    """Turn a ring from a process of its own: the other side of `CycleRun.cycles_beside`.
+
+    Raises HarnessError if a packet does not come back.
+    """
+    found: list[TimedSample] = []
+    ours, theirs = socket.socketpair()
+    with ours:
+        ours.settimeout(2 * TURN_SECONDS_MAX)
+        with theirs:
+            serve = partial(_turn_until_told, theirs, shape, packet_bytes, pin=pin)
+            child = _forked(os.getpid(), cores(pin=pin)[0], [ours, theirs], [theirs], serve)
+        data = array("q")
+        try:
+            yield found
+        finally:
+            with contextlib.suppress(OSError):  # it has ended already
+                ours.shutdown(socket.SHUT_WR)
+            with ours.makefile("rb") as got:
+                data.frombytes(got.read())
+            os.waitpid(child, 0)
+    if not data:
+        raise HarnessError("the bare ring: one of its processes died")
+    found += [
+        TimedSample(began_ns, took_ns / 1e3) for began_ns, took_ns in zip(data[::2], data[1::2], strict=True)
+    ]
+
+
+def _turn_until_told(line: socket.socket, shape: RingShape, packet_bytes: int, *, pin: bool) -> None:
+    """Turn a ring in `THEIRS` until the line ends; then send when each turn began, and its time (ns)."""
+    taken = array("q")
+    with _ring(shape, packet_bytes, pin=pin) as turn_us:
+        while not linux.readable((line.fileno(),), THEIRS.left_ns(time.monotonic_ns()) / 1e9):
+            while not THEIRS.left_ns(began_ns := time.monotonic_ns()):
+                taken.extend((began_ns, round(turn_us() * 1e3)))
+    line.sendall(taken.tobytes())
+
+
+@contextlib.contextmanager
+def _ring(
+    shape: RingShape, packet_bytes: int, *, pin: bool, work: RingWork | None = None
+) -> Iterator[Callable[[], float]]:
+    """A ring; what it yields sends a packet through it, and returns its time (us)."""
     here, there = cores(pin=pin)
     packet = bytes(packet_bytes)
     pairs = [_channel() for _ in range(shape.hops)]
@@ -279,9 +411,7 @@ def ring_us(
         ours = pairs[0][0], pairs[-1][1]
         for end in set(ends) - set(ours):  # so the death of any of them ends the ring
             end.close()
-        with as_node(here):
-            times = [_turn_us(*ours, packet) for _ in range(warm_up + count)]
-        return times[warm_up:]
+        yield partial(_turn_us, *ours, packet)
     finally:
         for end in ends:
             end.close()

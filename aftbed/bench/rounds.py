@@ -3,7 +3,8 @@
 A virtual machine can be twice as slow in the next minute. So a figure alone says little, and so does a limit
 that was measured a minute before. What holds is the ratio of the two where both were measured within some
 seconds. `in_turn` alternates them: limit and figure, figure and limit, and so on. Neither is always the later
-one, so a drift of the machine within a round cancels out over two of them.
+one, so a drift of the machine within a round cancels out over two of them. Some machines are slower for a
+tenth of a second: there the two have to alternate within a round, by whatever measures both (`together`).
 
 `beside_limit` makes the ratio of each quantile in each round: that of the figure to the *median* of the limit
 in the same round, so the p99 of a figure is not excused by the tail of its limit. Over the rounds this gives
@@ -66,32 +67,54 @@ def in_turn(
     fails is measured again, in all at most `failures_max` times: a busy machine may fail it (`runs.tried`).
     Raises the HarnessError or ConfigError of the next failure.
     """
-    watch = MachineWatch()
     figures: list[Figure] = []
     limits: list[Limit] = []
-    failures = 0
-
-    def measure(number: int, what: Callable[[int], Value], into: list[Value]) -> None:
-        nonlocal failures
-        while len(into) == number:
-            try:
-                into.append(what(number))
-            except (HarnessError, ConfigError):
-                failures += 1
-                if failures > failures_max or interrupts.came():
-                    raise
-        watch.look()
-        show(len(figures) + len(limits), 2 * rounds)
-
-    show(0, 2 * rounds)
+    measured = _Measured(2 * rounds, failures_max, show)
     for number in range(rounds):
         if number % 2 == 0:
-            measure(number, limit, limits)
-            measure(number, figure, figures)
+            limits.append(measured.by(limit, number))
+            figures.append(measured.by(figure, number))
         else:
-            measure(number, figure, figures)
-            measure(number, limit, limits)
-    return Rounds(figures, limits, watch.found(failures))
+            figures.append(measured.by(figure, number))
+            limits.append(measured.by(limit, number))
+    return Rounds(figures, limits, measured.machine())
+
+
+def together(
+    rounds: int, both: Callable[[int], tuple[Figure, Limit]], show: Show = unshown
+) -> Rounds[Figure, Limit]:
+    """As `in_turn`, where one call measures the figure and its limit, in turns that are shorter."""
+    measured = _Measured(rounds, FAILURES_MAX, show)
+    found = [measured.by(both, number) for number in range(rounds)]
+    return Rounds([figure for figure, _ in found], [limit for _, limit in found], measured.machine())
+
+
+class _Measured:
+    """How many measurements were made, of so many, and how many failed; `show` is called between two."""
+
+    def __init__(self, total: int, failures_max: int, show: Show) -> None:
+        self._watch = MachineWatch()
+        self._total, self._failures_max, self._show = total, failures_max, show
+        self._done = self._failures = 0
+        show(0, total)
+
+    def by(self, what: Callable[[int], Value], number: int) -> Value:
+        """What `what` gives for that round, again if it fails."""
+        while True:
+            try:
+                found = what(number)
+                break
+            except (HarnessError, ConfigError):
+                self._failures += 1
+                if self._failures > self._failures_max or interrupts.came():
+                    raise
+        self._done += 1
+        self._watch.look()
+        self._show(self._done, self._total)
+        return found
+
+    def machine(self) -> "Meanwhile":
+        return self._watch.found(self._failures)
 
 
 def shares(count: int, rounds: int) -> list[int]:

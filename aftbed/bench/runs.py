@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 import msgspec
 
@@ -20,7 +20,7 @@ from aftbed.functions.request_file import GivenRequests
 from aftbed.judge.record import RunRecord, read_record
 from aftbed.runtime.unix import control_client, interrupts, linux
 from aftbed.runtime.unix.launch import Launched, launch, options_for
-from aftbed.runtime.unix.options import LoadRun
+from aftbed.runtime.unix.options import LoadRun, Turns
 
 REQUESTS_ENDLESS: Final = 10_000_000
 READY_SECONDS_MAX: Final = 10.0
@@ -135,9 +135,10 @@ def limited_run(
     pin: bool,
     application: str = "",
     given: GivenRequests | None = None,
+    turns: Turns | None = None,
 ) -> RunRecord:
     """The record of a run of `count` requests in a closed loop; see `RunOptions` and `LoadRun`."""
-    load = LoadRun(count, 0.0, given.source if given is not None else "")
+    load = LoadRun(count, 0.0, given.source if given is not None else "", turns=turns)
     return finished(_start(ftm, placement, load, pin, application, given), ends=("",))
 
 
@@ -152,10 +153,16 @@ class EndlessRun:
 
 @contextlib.contextmanager
 def endless_run(
-    ftm: str, placement: str, rate_hz: float = 0.0, *, application: str = "", pin: bool = True
+    ftm: str,
+    placement: str,
+    rate_hz: float = 0.0,
+    *,
+    application: str = "",
+    pin: bool = True,
+    turns: Turns | None = None,
 ) -> Iterator[EndlessRun]:
     """A run at `rate_hz` requests a second (0: a closed loop), stopped at the end of the block."""
-    launched = _start(ftm, placement, LoadRun(REQUESTS_ENDLESS, rate_hz), pin, application)
+    launched = _start(ftm, placement, LoadRun(REQUESTS_ENDLESS, rate_hz, turns=turns), pin, application)
     run = EndlessRun(launched.private)
     try:
         yield run
@@ -227,9 +234,16 @@ def wait_until_ready(private: Path) -> None:
     time.sleep(PAUSE_SECONDS)
 
 
-def latencies_us(
+class TimedSample(NamedTuple):
+    """A request, or whatever else was measured: when it began (monotonic ns), and how long it took."""
+
+    began_ns: int
+    us: float
+
+
+def answered(
     record: RunRecord, *, skip: int = 0, began_ns: int = 0, ended_ns: int | None = None
-) -> list[float]:
+) -> list[TimedSample]:
     """From request.sent to reply.delivered at the client, of the requests that were sent in that time.
 
     Without the first `skip` requests, and without those that were not answered.
@@ -242,5 +256,13 @@ def latencies_us(
             if within and event.request_id > skip:
                 sent[event.request_id] = event.t_ns
         elif event.request_id in sent:
-            found.append((event.t_ns - sent[event.request_id]) / 1e3)
+            sent_ns = sent[event.request_id]
+            found.append(TimedSample(sent_ns, (event.t_ns - sent_ns) / 1e3))
     return found
+
+
+def latencies_us(
+    record: RunRecord, *, skip: int = 0, began_ns: int = 0, ended_ns: int | None = None
+) -> list[float]:
+    """The times of the requests that `answered` finds."""
+    return [one.us for one in answered(record, skip=skip, began_ns=began_ns, ended_ns=ended_ns)]

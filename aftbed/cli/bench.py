@@ -14,7 +14,7 @@ import typer
 
 from aftbed.bench import ballast
 from aftbed.bench.adaptation import bench_adapt
-from aftbed.bench.cycle import CycleRun, bench_cycle, bench_cycle_beside, bench_hops
+from aftbed.bench.cycle import CYCLE_ROUNDS, CycleRun, bench_cycle, bench_cycle_beside, bench_hops
 from aftbed.bench.recovery import bench_recovery
 from aftbed.bench.resources import bench_launch, bench_memory
 from aftbed.bench.rounds import ROUNDS, text
@@ -59,7 +59,7 @@ def cycle(
         typer.Option(metavar=choices(PLACEMENTS), help="The placement of --beside, if it is another one."),
     ] = None,
     pin: Pin = True,
-    rounds: Rounds = ROUNDS,
+    rounds: Rounds = CYCLE_ROUNDS,
     json: Json = False,
 ) -> None:
     """Cycle time at the client, alternating with a bare ring of the same number of hops, or with --beside."""

@@ -29,6 +29,7 @@ from aftbed.bench.rounds import (
     in_turn,
     shares,
     text,
+    together,
 )
 from aftbed.bench.runs import Percentiles
 from aftbed.core.errors import ConfigError, HarnessError
@@ -75,6 +76,21 @@ def test_a_measurement_that_fails_is_repeated_and_counted() -> None:
     found = in_turn(2, figure, lambda number: order.append(f"limit {number}"))
     assert order == ["limit 0", "figure 0", "figure 1", "figure 1", "limit 1"]
     assert found.figures == [0, 1] and found.machine.failures == 1
+
+
+def test_what_is_measured_together_is_repeated_together() -> None:
+    begun: list[int] = []
+
+    def both(number: int) -> tuple[int, str]:
+        begun.append(number)
+        if begun == [0, 1]:
+            raise HarnessError("the machine is too busy")
+        return 10 * number, str(number)
+
+    shown: list[tuple[int, int]] = []
+    found = together(3, both, lambda done, total: shown.append((done, total)))
+    assert begun == [0, 1, 1, 2] and shown == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    assert (found.figures, found.limits, found.machine.failures) == ([0, 10, 20], ["0", "1", "2"], 1)
 
 
 def test_a_bench_that_fails_again_and_again_ends_with_the_reason() -> None:
@@ -290,7 +306,10 @@ def test_the_keys_of_a_document() -> None:
     }
 
 
-def test_one_cycle_is_measured_in_turn_with_another(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_function_of_the_user_is_measured_in_turn_with_the_other_cycle(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It may take longer than a turn of two runs that live side by side."""
     begun: list[tuple[str, str, int]] = []
 
     def cycles_us(run: cycle.CycleRun, count: int) -> list[float]:
@@ -298,7 +317,8 @@ def test_one_cycle_is_measured_in_turn_with_another(monkeypatch: pytest.MonkeyPa
         return [40.0 if run.placement == "replica" else 100.0] * count
 
     monkeypatch.setattr(cycle.CycleRun, "cycles_us", cycles_us)
-    ours, other = cycle.CycleRun("pbr", "replica"), cycle.CycleRun("lfr", "process")
+    ours = cycle.CycleRun("pbr", "replica", application="mine:Function")
+    other = ours._replace(ftm="lfr", placement="process")
     found = cycle.bench_cycle_beside(ours, other, 5, rounds=2)
     assert sorted(begun[:2]) == [("lfr", "process", 3), ("pbr", "replica", 3)]
     assert sorted(begun[2:]) == [("lfr", "process", 2), ("pbr", "replica", 2)]

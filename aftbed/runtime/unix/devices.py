@@ -4,19 +4,20 @@ from.
 
 import os
 import select
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from aftbed.core.messages import Reply
+from aftbed.core.messages import Reply, Submit
 from aftbed.ftm.client import Client
 from aftbed.functions.source import is_foreign
 from aftbed.runtime import control
-from aftbed.runtime.devices import CarDevice, CarLink, Device, Load, Senses, resume_client
+from aftbed.runtime.devices import CarDevice, CarLink, Device, Dialogue, Load, Senses, resume_client
 from aftbed.runtime.unix.death_notice import LifelineWatcher
 from aftbed.runtime.unix.journal_files import DialogueFile, dialogue_path, last_words
 from aftbed.runtime.unix.liveness import Liveness
-from aftbed.runtime.unix.options import GATEWAY, LoadRun, ReplayRun, SourceOptions
+from aftbed.runtime.unix.options import GATEWAY, LoadRun, ReplayRun, SourceOptions, Turns
 from aftbed.runtime.unix.request_store import stored_requests
 from aftbed.vehicle.aeb.function import sample_requests
 from aftbed.vehicle.aeb.messages import encode_fixed, encode_request
@@ -118,6 +119,33 @@ class BusLink(CarLink):
         }
 
 
+class LoadInTurns(Load):
+    """A closed loop that sends a request only in one of its turns.
+
+    Until that begins it sleeps, and its node with it: a turn is far shorter than what is taken for a hang.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        dialogue: Dialogue,
+        requests: list[bytes],
+        count: int,
+        turns: Turns,
+        on_end: Callable[[], None],
+    ) -> None:
+        super().__init__(client, dialogue, requests, count, 0.0, on_end)
+        self._turns = turns
+
+    def take(self, now_ns: int) -> Submit | None:
+        if self._client.unanswered:
+            return None
+        while left_ns := self._turns.left_ns(now_ns):  # again where it has slept through a turn
+            time.sleep(left_ns / 1e9)
+            now_ns = time.monotonic_ns()
+        return super().take(now_ns)
+
+
 def load_requests(seed: int, count: int, *, fixed: bool) -> list[bytes]:
     """What a load of `count` requests is drawn from, again and again; `fixed` as in `sample_requests`."""
     return sample_requests(seed, min(count, LOAD_REQUESTS), fixed=fixed)
@@ -139,6 +167,8 @@ def make_source(client: Client, options: SourceOptions, on_end: Callable[[], Non
             given = stored_requests(journals.parent)
             assert given, f"the requests are no longer in {journals.parent}"
             requests = list(given)
+        if work.turns is not None:
+            return LoadInTurns(client, dialogue, requests, work.count, work.turns, on_end)
         return Load(client, dialogue, requests, work.count, work.rate_hz, on_end)
     # Imported here: the bus costs 150 ms to import, and only the zygote of the bus has it.
     from aftbed.vehicle.can.dbc_file import own_dbc  # noqa: PLC0415

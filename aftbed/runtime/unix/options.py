@@ -18,16 +18,30 @@ PLAYER: Final = "player"
 *_, GATEWAY = NODES
 
 
+class Turns(msgspec.Struct, frozen=True):
+    """Every second turn of `ns` of the monotonic clock: the even ones (`number` 0) or the odd ones (1)."""
+
+    ns: int
+    number: int
+
+    def left_ns(self, now_ns: int) -> int:
+        """Until the next of these turns begins; 0 within one."""
+        turn, into_ns = divmod(now_ns, self.ns)
+        return 0 if turn % 2 == self.number else self.ns - into_ns
+
+
 class LoadRun(msgspec.Struct, frozen=True, tag=True):
     """Requests without a car: drawn from the seed, for benches and tests, or given by the user.
 
-    `requests`, `expect`: what the user named, "" if nothing; the record has what was in them.
+    `requests`, `expect`: what the user named, "" if nothing; the record has what was in them. `turns`: a
+    closed loop sends only in these, and the others are left to what a bench measures beside it.
     """
 
     count: int
     rate_hz: float  # 0: closed loop
     requests: str = ""
     expect: str = ""
+    turns: Turns | None = None
 
     @property
     def option(self) -> str:
