@@ -5,8 +5,8 @@ waits until redundancy is back. Times are from the journals, whose clock is comm
 
 `death_ms` is the limit of any detection: from SIGKILL of a process to the moment at which another one that
 polls its pidfd sees that it is dead. The victim runs as a node of the leader's chain does, the other one as
-a Watchdog does. Kills and deaths alternate: each round has a run of its own, and as many deaths as kills, but
-at least DEATHS_MIN.
+a Watchdog does. Kills and deaths alternate: before each kill, when redundancy is back, the load pauses for a
+turn of `TURN_NS`, and in it a death is measured.
 """
 
 import os
@@ -19,7 +19,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from aftbed.bench.rounds import ROUNDS, InRounds, become_node, beside_limit, cores, in_turn, shares
+from aftbed.bench.rounds import ROUNDS, InRounds, become_node, beside_limit, cores, shares, together
 from aftbed.bench.runs import POLL_SECONDS, Percentiles, endless_run, percentiles, wait_for
 from aftbed.core.errors import HarnessError
 from aftbed.core.progress import Show, unshown
@@ -28,11 +28,14 @@ from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault
 from aftbed.judge.checks import failovers
 from aftbed.runtime.unix import control_client, interrupts, linux
+from aftbed.runtime.unix.options import Turns
 
 REDUNDANCY_SECONDS_MAX: Final = 5.0
-PAUSE_SECONDS: Final = 0.02  # of undisturbed service between two kills
+PAUSE_SECONDS: Final = 0.01  # of undisturbed service before a kill
 DEATH_SECONDS_MAX: Final = 5.0
-DEATHS_MIN: Final = 5  # in a round
+DEATHS_MIN: Final = 5  # in a round of adaptations
+TURN_NS: Final = 40_000_000  # a death takes half of it, with its forks, and a client that waits is not hung
+OURS, THEIRS = Turns(TURN_NS, 0), Turns(TURN_NS, 1)
 DEATH: Final = "SIGKILL to a pidfd readable elsewhere"
 PARTS: Final = ("detection", "fencing", "promotion", "first_reply")
 
@@ -61,11 +64,8 @@ def bench_recovery(
 ) -> RecoveryResult:
     """Kill the primary `kills` times. Raises HarnessError."""
     share = shares(kills, rounds)
-    found = in_turn(
-        len(share),
-        lambda number: _recoveries(ftm, placement, share[number], pin=pin),
-        lambda number: deaths_ms(share[number], pin=pin),
-        show=show,
+    found = together(
+        len(share), lambda number: _recoveries_and_deaths(ftm, placement, share[number], pin=pin), show
     )
     recoveries = [one for values in found.figures for one in values]
     parts = {name: [one.parts_ms[n] for one in recoveries] for n, name in enumerate(PARTS)}
@@ -84,17 +84,24 @@ def bench_recovery(
     )
 
 
-def _recoveries(ftm: str, placement: str, kills: int, *, pin: bool) -> list[_Recovery]:
-    """Of a run whose primary is killed so often."""
-    with endless_run(ftm, placement, pin=pin) as run:
+def _recoveries_and_deaths(
+    ftm: str, placement: str, kills: int, *, pin: bool
+) -> tuple[list[_Recovery], list[float]]:
+    """Of a run whose primary is killed so often, and as many deaths (ms) in between."""
+    deaths_ms = []
+    with endless_run(ftm, placement, pin=pin, turns=OURS) as run:
         epoch = 0
-        for number in range(kills + 1):
+        for _ in range(kills):
             epoch = _redundant_epoch(run.private, epoch)
+            for turns in (OURS, THEIRS):
+                _sleep_until(turns)
+            deaths_ms.append(death_ms(pin=pin))
+            _sleep_until(OURS)
             time.sleep(PAUSE_SECONDS)
-            if number < kills:
-                control_client.ask(
-                    run.private, control_client.InjectCommand(Fault(Crash(), "primary", Trigger()))
-                )
+            control_client.ask(
+                run.private, control_client.InjectCommand(Fault(Crash(), "primary", Trigger()))
+            )
+        _redundant_epoch(run.private, epoch)
     found = []
     for f in failovers(run.record.history, run.record.faults):
         if f.detected_ms is None or f.fenced_ms is None or f.promoted_ms is None or f.recovered_ms is None:
@@ -104,7 +111,12 @@ def _recoveries(ftm: str, placement: str, kills: int, *, pin: bool) -> list[_Rec
         found.append(_Recovery(f.recovered_ms, (detection, fencing, promotion, first_reply)))
     if len(found) < kills:
         raise HarnessError(f"{kills} kills, but only {len(found)} recoveries in the journals")
-    return found
+    return found, deaths_ms
+
+
+def _sleep_until(turns: Turns) -> None:
+    """Return in one of them."""
+    time.sleep(turns.left_ns(time.monotonic_ns()) / 1e9)
 
 
 def _redundant_epoch(private: Path, after: int) -> int:
