@@ -38,6 +38,7 @@ QUICK: Final = {  # what makes a command short; too few samples to quote
     "launch": "--runs 1",
     "campaign": "--experiments 4 --rounds 1",
     "state": "--rounds 1",
+    "simulator": "--count 2000 --rounds 2",
 }
 
 Document = dict[str, object]

@@ -14,7 +14,7 @@ from typing import Final
 
 from msgspec.structs import replace
 
-from aftbed.bench.rounds import ROUNDS, InRounds, beside_limit, in_turn, shares
+from aftbed.bench.rounds import SHORT_ROUNDS, InRounds, beside_limit, in_turn, shares
 from aftbed.bench.runs import Percentiles, percentiles
 from aftbed.core.errors import HarnessError
 from aftbed.core.journal import EntryKind
@@ -39,7 +39,7 @@ class SimulatorResult(InRounds, frozen=True):
 
 
 def bench_simulator(
-    ftm: str, placement: str, requests: int, *, rounds: int = ROUNDS, show: Show = unshown
+    ftm: str, placement: str, requests: int, *, rounds: int = SHORT_ROUNDS, show: Show = unshown
 ) -> SimulatorResult:
     """Simulate `requests` requests, over all rounds. Raises ConfigError."""
     share = shares(requests, rounds)

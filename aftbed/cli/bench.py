@@ -17,7 +17,7 @@ from aftbed.bench.adaptation import bench_adapt
 from aftbed.bench.cycle import CYCLE_ROUNDS, CycleRun, bench_cycle, bench_cycle_beside, bench_hops
 from aftbed.bench.recovery import bench_recovery
 from aftbed.bench.resources import bench_launch, bench_memory
-from aftbed.bench.rounds import ROUNDS, text
+from aftbed.bench.rounds import ROUNDS, SHORT_ROUNDS, text
 from aftbed.cli.interrupted import told_if_interrupted
 from aftbed.cli.options import App, Ftm, Json, Recipe, check_range, choices, print_json
 from aftbed.cli.parsing import PlainGroup
@@ -203,8 +203,8 @@ def campaign(
 def simulator(
     ftm: Ftm = "pbr",
     placement: Placement = "process",
-    count: Annotated[int, typer.Option(min=100, help="Requests over all rounds.")] = 22_000,
-    rounds: Rounds = ROUNDS,
+    count: Annotated[int, typer.Option(min=100, help="Requests over all rounds.")] = 55_000,
+    rounds: Rounds = SHORT_ROUNDS,
     json: Json = False,
 ) -> None:
     """Requests per second of one core in the simulator, beside a bare loop of as many calls."""
