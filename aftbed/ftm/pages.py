@@ -112,6 +112,8 @@ class CheckpointBase:
             self.forget()
             return state
         self._keep(application, number, state)
+        if knows_changes(application):
+            application.changes(self._page_bytes)  # those up to here are in `state`
         self._left = self._whole_every - 1
         return sealed(Pages(len(state), 0, self._page_bytes, (), state, 0))
 
@@ -145,11 +147,7 @@ class CheckpointBase:
 
     def _keep(self, application: Application, number: int, state: bytes) -> None:
         self._number, self._state_bytes = number, len(state)
-        if knows_changes(application):
-            application.changes(self._page_bytes)  # those up to here are in `state`
-            self._state = None
-        else:
-            self._state = state
+        self._state = None if knows_changes(application) else state
 
 
 # -- pages ----------------------------------------------------------------------------------------

@@ -47,9 +47,10 @@ class Memory:
 class Tracked(Memory):
     """The same; it knows its changes."""
 
-    known = b""
+    known, asked = b"", 0
 
     def changes(self, page_bytes: int) -> Mapping[int, bytes]:
+        self.asked += 1
         numbers = changed_pages(self.known, self.state, page_bytes)
         self.known = self.state
         return {n: self.state[n * page_bytes : (n + 1) * page_bytes] for n in numbers}
@@ -308,6 +309,15 @@ def test_it_is_captured_for_a_whole_checkpoint_only() -> None:
         sent = pages_of(pair.send(with_byte(pair.leader.state, at * PAGE)))
         assert len(sent.data) == (PAGE if at else LARGE)
     assert (pair.leader.captured, pair.backup.captured) == (1, 0)
+
+
+def test_a_backup_does_not_ask_for_changes() -> None:
+    """Behind a whole state these would be all of it, and it gives a whole one first when it leads."""
+    pair = Duplex(Tracked(bytes(LARGE)), Tracked(), 3)
+    for number in range(5):
+        pair.send(bytes([number]) * PAGE + bytes(LARGE - PAGE))
+    assert isinstance(pair.leader, Tracked) and isinstance(pair.backup, Tracked)
+    assert (pair.leader.asked, pair.backup.asked) == (5, 0)
 
 
 def test_its_backup_refuses_pages_for_a_state_that_was_replaced() -> None:

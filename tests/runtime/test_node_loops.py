@@ -24,7 +24,7 @@ from aftbed.core.brick import Brick, Effect, Note, Order, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.graph import Link
-from aftbed.core.journal import FLAG_OFFSET, records
+from aftbed.core.journal import ACTIVITY_OFFSET, FLAG_OFFSET, records
 from aftbed.core.messages import AnyMessage, Rebound, Reply, Request
 from aftbed.core.script import Script
 from aftbed.inject import model
@@ -94,6 +94,8 @@ class Scripted(Brick):
             case "note":
                 notes = [Note(Event.SERVER_ENTER, number), Note(Event.SERVER_EXIT, number)]
                 return [*notes, Send("out", Reply(1, number, 1, b"c"))]
+            case "answer at length":
+                return [Send("out", Reply(1, number, 1, bytes(messages.PACKET_BYTES_MAX)))]
             case "order":
                 return [Order(Script("nothing", "", (), ()))]
             case _:
@@ -251,6 +253,22 @@ def test_a_fault_that_is_armed_leaves_the_fast_loop_until_it_has_struck() -> Non
     replies = [messages.decode(packet) for packet in sent]
     assert [r.payload for r in replies if isinstance(r, Reply)][:2] == [b"`b", b"ab"]
     assert [event for event, *_ in noted].count(Event.FAULT_APPLIED) == 1, "given twice, it began anew"
+
+
+@pytest.mark.parametrize("loop", [UnixIO.loop, UnixIO.turn])
+def test_a_node_that_writes_a_large_packet_executes_no_brick_meanwhile(loop: Loop, tmp_path: Path) -> None:
+    """As watchers see it: what it takes to write ten megabytes is not added to the time of the step."""
+    harness, activities = Harness(tmp_path / "journal"), list[int]()
+
+    def put(end: int, data: bytes | memoryview) -> None:
+        activities.append(harness.io.journal.mapping[ACTIVITY_OFFSET])
+        transport.put(end, data)
+
+    with mock.patch.object(node_io, "_put", put):
+        harness.run([packet(what) for what in ("nothing", "nothing", "answer at length")], loop)
+    assert activities and not any(activity & 1 for activity in activities)
+    assert harness.io.journal.mapping[ACTIVITY_OFFSET] & 1
+    harness.close()
 
 
 @pytest.mark.parametrize("loop", [UnixIO.loop, UnixIO.turn])

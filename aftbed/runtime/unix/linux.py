@@ -34,7 +34,8 @@ ADOPTION_SECONDS_MAX: Final = 5.0
 FILES_GOOD: Final = 1024  # a supervisor of 37 processes holds 180, more while it adapts
 _START: Final = 19  # the field `starttime` of /proc/PID/stat, the state being 0
 SLICE_NS: Final = 500_000  # shorter than the default of some ms, long enough for all that a failover orders
-REUSED_BYTES_MAX: Final = 16 << 20
+REUSED_BYTES_MAX: Final = 32 << 20  # the greatest that mallopt(3) takes on 64 bits
+KEPT_BYTES_MAX: Final = 4 * REUSED_BYTES_MAX  # a state as it was read, decoded, restored and encoded
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # malloc.h
 INHERITED_FD: Final = 3  # of an interpreter that `start_interpreter` started
 
@@ -235,10 +236,11 @@ def reuse_blocks() -> None:
     """Have the memory of blocks up to `REUSED_BYTES_MAX` used again, here and in all forks from here on.
 
     By default the C library gives it back at once, and each page of the next block is a fault and is cleared:
-    for a state of 1 MB that takes longer than to copy and to compare it. Larger blocks go back.
+    for a state of 1 MB that takes longer than to copy and to compare it. Larger blocks go back, and what is
+    free above `KEPT_BYTES_MAX`.
     """
     _libc.mallopt(M_MMAP_THRESHOLD, REUSED_BYTES_MAX)
-    _libc.mallopt(M_TRIM_THRESHOLD, 2 * REUSED_BYTES_MAX)
+    _libc.mallopt(M_TRIM_THRESHOLD, KEPT_BYTES_MAX)
 
 
 def waited_ns(pid: int) -> int:

@@ -16,7 +16,8 @@ same mail and compares.
 Around each wait, for mail, orders, room or time, the host changes the activity in the journal's header: a
 byte that is even while it waits, odd while it executes bricks, and another one each time. Watchers look at it
 (`liveness`), so a node that has nothing to do sleeps. The two bytes cost 0.17 us a hop; the timer that
-they replaced, whose signal wrote the time, cost 17 idle processes a tenth of a core.
+they replaced, whose signal wrote the time, cost 17 idle processes a tenth of a core. A large packet that is
+read or written counts as a wait: ten megabytes take longer than a step, and no brick is executed meanwhile.
 
 What is read from a channel is handled before anything else is read, so mail is either in the kernel, where it
 outlives this process, or inside a request that the client will ask again.
@@ -255,7 +256,7 @@ class UnixIO(NodeIO[Inlet, int]):
                         continue
                     data = raw if effect.message is read else _encode(effect.message)
                     try:
-                        (_write if len(data) <= _LARGE else _put)(out, data)
+                        (_write if len(data) <= _LARGE else self._put_large)(out, data)
                     except OSError:
                         journal.at = at  # orders that are served meanwhile may write records
                         self._write_hard(hosted, effect.port, out, data)
@@ -412,10 +413,18 @@ class UnixIO(NodeIO[Inlet, int]):
         """Send `message`, and wait for room. Raises BrokenPipeError: see `_write_hard`."""
         data = _encode(message) if raw is None else raw
         try:
-            (_write if len(data) <= _LARGE else _put)(end, data)
+            (_write if len(data) <= _LARGE else self._put_large)(end, data)
         except OSError:
             self._write_hard(hosted, port, end, data)
         return True
+
+    def _put_large(self, end: int, data: bytes | memoryview) -> None:
+        """Raises OSError as `transport.put` does."""
+        self._begin_wait()
+        try:
+            _put(end, data)
+        finally:
+            self._end_wait()
 
     def write_or_drop(self, end: int, message: Message) -> None:
         """Send `message` if there is room and a reader: the brick asks again for what it wants."""
