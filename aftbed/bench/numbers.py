@@ -8,7 +8,8 @@ document has it: both were measured in turn (`rounds`).
 Of a ratio that a document has, the table of one pass shows as the p50 the median of the rounds with its
 quartiles, and the p99 over all rounds (`rounds.QuantileRatio`). Of several passes, one behind the other, it
 shows the median of each value over the passes, and its quartiles over the passes: they say how far one pass
-can be trusted.
+can be trusted. A command that fails in a pass leaves its lines without a value in that pass; the table says
+how often that was, and why.
 """
 
 import datetime
@@ -24,8 +25,9 @@ from aftbed.bench.rounds import Ratio
 from aftbed.bench.runs import Log, run_python, tried
 from aftbed.campaign.ledger import Environment, here
 from aftbed.campaign.statistics import quantile
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.progress import Show, unshown
+from aftbed.runtime.unix import interrupts
 from aftbed.runtime.unix.code_version import code_version
 
 COMMAND_SECONDS_MAX: Final = 1200.0
@@ -180,7 +182,8 @@ class Number(msgspec.Struct, frozen=True):
 
     `quartiles`: of one pass, those of the p50 of a ratio over its `rounds`; None where the ratio is not one
     of rounds. Of several passes, over them: of the p50 of the ratio, or of a figure without a limit (its p50,
-    if it has one); None of what is counted.
+    if it has one); None of what is counted. `failed`: in how many passes the command failed, so that they are
+    not in it; `reason`: what it said last. One that failed in all of them has no values, and misses its goal.
     """
 
     what: str
@@ -195,6 +198,8 @@ class Number(msgspec.Struct, frozen=True):
     met: bool | None
     quartiles: tuple[float, float] | None = None
     rounds: int | None = None
+    failed: int = 0
+    reason: str = ""
 
 
 class Numbers(msgspec.Struct, frozen=True):
@@ -209,6 +214,11 @@ class Numbers(msgspec.Struct, frozen=True):
     passes: int = 1
 
 
+def not_measured(found: Numbers) -> list[str]:
+    """The commands that failed in every pass."""
+    return list(dict.fromkeys(one.command for one in found.numbers if not one.measured))
+
+
 def bench_all(
     log: Log,
     *,
@@ -219,7 +229,7 @@ def bench_all(
 ) -> Iterator[Numbers]:
     """Measure every line `passes` times; yields after each pass what all up to now have found.
 
-    `log` gets each command. Raises HarnessError if one fails again and again.
+    `log` gets each command. One that fails `TRIES` times in a pass is left out of it.
     """
     began_s = time.monotonic()
     run = measure or _measured
@@ -227,10 +237,10 @@ def bench_all(
     words = {one: f"{one} {QUICK.get(one.split()[0], '')}".strip() if quick else one for one in commands}
     by_pass: list[list[Number]] = []
     for number in range(passes):
-        found: dict[str, Document] = {}
+        found: dict[str, Document | HarnessError] = {}
         for one, command in words.items():
             show(number * len(words) + len(found), passes * len(words))
-            found[one] = tried(f"aftbed bench {command}", partial(run, command), log)
+            found[one] = _tried(command, run, log)
         by_pass.append([_number(line, found[line.command]) for line in LINES])
         yield Numbers(
             datetime.datetime.now(datetime.UTC).date().isoformat(),
@@ -249,7 +259,20 @@ def _measured(command: str) -> Document:
     return msgspec.json.decode(run_python(arguments, COMMAND_SECONDS_MAX), type=Document)
 
 
-def _number(line: TableLine, document: Document) -> Number:
+def _tried(command: str, run: Callable[[str], Document], log: Log) -> Document | HarnessError:
+    """What `run` gives, or why it failed."""
+    try:
+        return tried(f"aftbed bench {command}", partial(run, command), log)
+    except HarnessError as error:
+        if interrupts.came():
+            raise
+        log(f"not measured: {error}")
+        return error
+
+
+def _number(line: TableLine, document: Document | HarnessError) -> Number:
+    if isinstance(document, HarnessError):
+        return _not_measured(line, str(document))
     measured = figure_at(document, line.figure)
     ratios: dict[str, float] = {}
     limit_p50, limit_name, rounds = None, "", None
@@ -275,6 +298,23 @@ def _number(line: TableLine, document: Document) -> Number:
     )
 
 
+def _not_measured(line: TableLine, reason: str) -> Number:
+    return Number(
+        line.what,
+        f"aftbed bench {line.command}",
+        line.unit,
+        {},
+        "",
+        None,
+        {},
+        line.goal,
+        line.more_is_better,
+        False if line.goal else None,
+        failed=1,
+        reason=reason,
+    )
+
+
 def _met(line: TableLine, values: dict[str, float]) -> bool | None:
     kept = [values[name] >= g if line.more_is_better else values[name] <= g for name, g in line.goal.items()]
     return all(kept) if kept else None
@@ -282,6 +322,14 @@ def _met(line: TableLine, values: dict[str, float]) -> bool | None:
 
 def _over_passes(line: TableLine, numbers: tuple[Number, ...]) -> Number:
     """The line over all passes: the median of each value, and the quartiles of what is compared."""
+    failed = [one for one in numbers if one.failed]
+    if len(failed) == len(numbers):
+        return msgspec.structs.replace(numbers[-1], failed=len(failed))
+    found = _over_measured(line, [one for one in numbers if not one.failed])
+    return msgspec.structs.replace(found, failed=len(failed), reason=failed[-1].reason if failed else "")
+
+
+def _over_measured(line: TableLine, numbers: list[Number]) -> Number:
     if len(numbers) == 1:
         return numbers[0]
     measured = _summary([one.measured for one in numbers], sum if line.counted else _median)
@@ -380,7 +428,16 @@ def markdown(found: Numbers) -> Iterator[str]:
 
 def _measured_words(one: Number) -> str:
     """`p50 1.5, p99 3.1 ms`; with the quartiles of its first value where there is no ratio that has them."""
-    return f"{_words(one.measured, None if one.ratios else one.quartiles)} {one.unit}".strip()
+    if not one.measured:
+        return f"**not measured**: {_in_cell(one.reason)}"
+    words = f"{_words(one.measured, None if one.ratios else one.quartiles)} {one.unit}".strip()
+    if not one.failed:
+        return words
+    return f"{words}; failed in {one.failed} pass{'es' * (one.failed > 1)}: {_in_cell(one.reason)}"
+
+
+def _in_cell(reason: str) -> str:
+    return " ".join(reason.replace("|", "/").split())
 
 
 def _ratio_words(one: Number) -> str:

@@ -21,7 +21,7 @@ from aftbed.bench.rounds import ROUNDS, SHORT_ROUNDS, text
 from aftbed.cli.interrupted import told_if_interrupted
 from aftbed.cli.options import App, Ftm, Json, Recipe, check_range, choices, print_json
 from aftbed.cli.parsing import PlainGroup
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.graph import PLACEMENTS
 from aftbed.ftm.compose import DUPLEX, canonical, replication_of
 from aftbed.functions.load import OWN_CODE
@@ -311,6 +311,8 @@ def every(
             if into is not None:
                 numbers.write_into(into, found)
     print(msgspec.json.encode(found).decode() if json else "\n".join(numbers.markdown(found)))
+    if missing := numbers.not_measured(found):
+        raise HarnessError(f"not measured: {', '.join(missing)}; the table has the reasons")
 
 
 @bench.command()

@@ -22,8 +22,10 @@ from aftbed.bench.numbers import (
     check_page,
     figure_at,
     markdown,
+    not_measured,
     write_into,
 )
+from aftbed.bench.runs import TRIES
 from aftbed.core.errors import ConfigError, HarnessError
 
 TIMES: Final = {"p50": 2.0, "p95": 3.0, "p99": 4.0, "max": 5.0}
@@ -115,6 +117,42 @@ def test_a_command_that_fails_is_tried_again() -> None:
     (found,) = bench_all(logged.append, measure=flaky)
     assert found.numbers == measured().numbers
     assert logged[1] == "aftbed bench cycle --ftm pbr, again (the machine is too busy)"
+
+
+def failing_in(passes: int, *, of: int) -> Numbers:
+    """`of` passes, in the first `passes` of which the memory cannot be measured."""
+    begun: Counter[str] = Counter()
+
+    def measure(command: str) -> Document:
+        begun[command] += 1
+        if command.startswith("memory") and begun[command] <= TRIES * passes:
+            raise HarnessError(f"too busy | the {begun[command]}. time")
+        return fake(command)
+
+    logged: list[str] = []
+    *_, found = bench_all(logged.append, passes=of, measure=measure)
+    assert sum(line.startswith("not measured: ") for line in logged) == passes
+    return found
+
+
+def test_a_command_that_fails_leaves_the_other_lines() -> None:
+    """It is told, misses its goal, and is none of those with a value."""
+    found = failing_in(1, of=1)
+    assert not_measured(found) == ["aftbed bench memory --ftm pbr"]
+    rest = [one for one in found.numbers if one.measured]
+    assert rest == [one for one in measured().numbers if "memory" not in one.command]
+    (row,) = [row for row in markdown(found) if row.startswith("| memory of")]
+    why = "aftbed bench memory --ftm pbr: failed 3 times, the last time: too busy / the 3. time"
+    assert row.startswith(f"| memory of the 17 processes (PSS) | **not measured**: {why} |")
+    assert row.count("|") == 7 and "at most 70: **missed**" in row
+
+
+def test_a_pass_without_a_value_is_not_in_the_median_and_is_told() -> None:
+    found = failing_in(2, of=3)
+    assert not not_measured(found)
+    (row,) = [row for row in markdown(found) if row.startswith("| memory of")]
+    assert "| 80 MB; failed in 2 passes: aftbed bench memory --ftm pbr: failed 3 times" in row
+    assert not_measured(failing_in(3, of=3)) == ["aftbed bench memory --ftm pbr"]
 
 
 def test_a_cycle_stands_beside_its_ring() -> None:
