@@ -44,6 +44,7 @@ Limits: other work on the machine is in the upper quantiles. The journal's write
 import contextlib
 import itertools
 import os
+import signal
 import socket
 import time
 from array import array
@@ -367,8 +368,9 @@ def ring_in_their_turns(shape: RingShape, packet_bytes: int, *, pin: bool) -> It
         finally:
             with contextlib.suppress(OSError):  # it has ended already
                 ours.shutdown(socket.SHUT_WR)
-            with ours.makefile("rb") as got:
+            with ours.makefile("rb") as got, contextlib.suppress(TimeoutError):
                 data.frombytes(got.read())
+            os.kill(child, signal.SIGKILL)  # it has ended, or it hangs
             os.waitpid(child, 0)
     if not data:
         raise HarnessError("the bare ring: one of its processes died")
