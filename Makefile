@@ -45,7 +45,7 @@ help:
 	@echo "make pictures    the pictures of the README, of runs that it makes (ONLY=page: that one; with Chromium and tmux)"
 	@echo "make mutants     plant bugs one by one, see what notices them, write docs/assumptions.md (ONLY=words: some, print)"
 	@echo "make soak        one run of 30 minutes with a crash every 2 s, an adaptation every 5 s: does anything grow?"
-	@echo "make bench       every figure of docs/numbers.md, written into its table: ten minutes (PASSES=10: ten times; OLD=VENV: then compare with it)"
+	@echo "make bench       every figure of docs/numbers.md, written into its table: a quarter of an hour (PASSES=10: ten times; OLD=VENV: then compare with it)"
 
 # Where the tests are installed, the package is too: then the demo needs nothing more.
 demo: $(if $(wildcard $(EDITABLE)),$(EDITABLE),$(PLAIN))
