@@ -214,7 +214,7 @@ class UnixIO(NodeIO[Inlet, int]):
         inlets, fronts, journal = self._inlets, self._fronts, self.journal
         open_ports = fronts[0].brick.open_ports if len(fronts) == 1 else partial(_open_ports, fronts)
         mapping = journal.mapping
-        activity, buffer, views = mapping[ACTIVITY_OFFSET], _BUFFER, _VIEWS
+        buffer, views = _BUFFER, _VIEWS
         obeyed = False
         while not obeyed:
             at = journal.at
@@ -230,9 +230,9 @@ class UnixIO(NodeIO[Inlet, int]):
                     if found is None or (device is not None and node.step_device(device)):
                         return
                     inlet, read_into = found
-                    mapping[ACTIVITY_OFFSET] = activity = (activity + 1) & 254
+                    mapping[ACTIVITY_OFFSET] = activity = (mapping[ACTIVITY_OFFSET] + 1) & 254
                     size = read_into(buffer)
-                    mapping[ACTIVITY_OFFSET] = activity = activity + 1
+                    mapping[ACTIVITY_OFFSET] = activity + 1
                     if not 2 <= size < READ_BYTES_MAX or mapping[FLAG_OFFSET] or at > journal.end:
                         self._handle_packet(inlet, bytes(buffer[:size]))
                         return
