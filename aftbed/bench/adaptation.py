@@ -9,8 +9,9 @@ An update exchanges the function, under the same mechanism: two versions with a 
 replace each other.
 
 The limit is that of a failover, SIGKILL to a pidfd readable elsewhere (`recovery`): no brick can be replaced
-by another process sooner than the kernel takes to tell of the end of one. The two alternate; each round has a
-run of its own.
+by another process sooner than the kernel takes to tell of the end of one. The two alternate, when the spares
+that the last adaptation took are forked anew: the load pauses for a death, and goes on before the adaptation
+is ordered. Each round has a run of its own.
 
 The paper's recipe may leave a request in a brick that is killed, and then nothing is served any more. So
 each of its adaptations has a run of its own; those that never answer again are counted as `stuck`.
@@ -30,8 +31,8 @@ from msgspec import Meta
 from aftbed.adapt.planner import APPLICATION, plan
 from aftbed.bench import ballast
 from aftbed.bench.cycle import RING_BYTES, ring_of, ring_us
-from aftbed.bench.recovery import DEATH, deaths_ms
-from aftbed.bench.rounds import ROUNDS, BesideLimit, Meanwhile, beside_limit, in_turn, shares
+from aftbed.bench.recovery import DEATH, OF_LOAD, death_at_rest_ms
+from aftbed.bench.rounds import ROUNDS, BesideLimit, Meanwhile, beside_limit, shares, together
 from aftbed.bench.runs import (
     PAUSE_SECONDS,
     EndlessRun,
@@ -137,12 +138,12 @@ def bench_adapt(
     ring = ring_us(ring_of(ways[0].old), RING_BYTES, RING_COUNT, pin=pin)
     share = shares(count, rounds)
 
-    def adaptations(number: int) -> _Round:
+    def adaptations(number: int) -> tuple[_Round, list[float]]:
         if recipe == RECIPES[0]:
             return _there_and_back(ways, share[number], pin=pin)
         return _each_in_a_run(ways[0], share[number], pin=pin)
 
-    found = in_turn(len(share), adaptations, lambda number: deaths_ms(share[number], pin=pin), show=show)
+    found = together(len(share), adaptations, show)
     there, back = ([one.there for one in found.figures], [one.back for one in found.figures])
     records = [record for one in found.figures for record in one.records]
     counts = [_requests(record) for record in records]
@@ -184,32 +185,36 @@ def _versions(ftm: str, placement: str, size_bytes: int) -> list[_Way]:
 
 def _run_of(way: _Way, *, pin: bool) -> AbstractContextManager[EndlessRun]:
     graph = way.old
-    return endless_run(graph.ftm, graph.placement, RATE_HZ, application=protected_by(graph), pin=pin)
+    return endless_run(
+        graph.ftm, graph.placement, RATE_HZ, application=protected_by(graph), pin=pin, turns=OF_LOAD
+    )
 
 
-def _there_and_back(ways: Sequence[_Way], count: int, *, pin: bool) -> _Round:
-    """In one run."""
-    there: Outcomes = []
-    back: Outcomes = []
+def _there_and_back(ways: Sequence[_Way], count: int, *, pin: bool) -> tuple[_Round, list[float]]:
+    """In one run, with a death (ms) before each adaptation."""
+    found, deaths_ms = _Round([], [], []), list[float]()
     with _run_of(ways[0], pin=pin) as run:
         wait_until_ready(run.private)
         for _ in range(count):
-            for way, outcomes in zip(ways, (there, back), strict=True):
+            for way, outcomes in zip(ways, (found.there, found.back), strict=True):
+                deaths_ms.append(death_at_rest_ms(run.private, pin=pin))
                 outcomes.append(adapted(run.private, way.goal))
                 time.sleep(PAUSE_SECONDS)
-    return _Round(there, back, [run.record])
+    found.records.append(run.record)
+    return found, deaths_ms
 
 
-def _each_in_a_run(way: _Way, count: int, *, pin: bool) -> _Round:
+def _each_in_a_run(way: _Way, count: int, *, pin: bool) -> tuple[_Round, list[float]]:
     """There only, since it may be the last thing that the run does."""
-    found = _Round([], [], [])
+    found, deaths_ms = _Round([], [], []), list[float]()
     for _ in range(count):
         with _run_of(way, pin=pin) as run:
             wait_until_ready(run.private)
+            deaths_ms.append(death_at_rest_ms(run.private, pin=pin))
             found.there.append(adapted(run.private, way.goal))
             time.sleep(PAUSE_SECONDS)
         found.records.append(run.record)
-    return found
+    return found, deaths_ms
 
 
 def _commit_of(way: _Way) -> _Commit:

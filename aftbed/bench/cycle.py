@@ -8,8 +8,8 @@ to a process on the backup's core, which reads and drops it.
 
 **Turns.** In each round a run and a ring live side by side, and take turns of `TURN_NS` by the monotonic
 clock: the load sends only in its turns, the ring turns in the others. So a machine that is slower for a tenth
-of a second is slower for both. What began in the first `SETTLE_NS` of a turn, with caches that the other side
-has filled, is left out, and so is what did not end in its turn. A function of the user may take longer than a
+of a second is slower for both. What began in the first tenth of a turn, with caches that the other side has
+filled, is left out, and so is what did not end in its turn. A function of the user may take longer than a
 turn: its cycle and the ring are measured one behind the other (`rounds.in_turn`).
 
 **Hop.** `bench_hops` reads the delay of one hop, as a distribution, from the journals of a run. All notes
@@ -49,7 +49,7 @@ import socket
 import time
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 from typing import Final, NamedTuple
@@ -96,14 +96,16 @@ from aftbed.runtime.unix.options import Turns
 from aftbed.vehicle.aeb.function import sample_requests
 
 CYCLE_ROUNDS: Final = 2 * ROUNDS  # the ratios of two runs differ more than those of two turns
+CYCLES: Final = 750 * CYCLE_ROUNDS  # a quarter of a second in each
 WARM_UP: Final = 200  # requests, and turns of the ring
+WARM_UP_SECONDS: Final = 0.2  # of what is measured by time
 RING_BYTES, RING_COUNT = 64, 300  # a packet and the turns of `ring_p50_us`
 READ_BYTES_MAX: Final = 4096
 TURN_SECONDS_MAX: Final = 10.0  # of a packet through the ring
 assert READ_BYTES_MAX <= PACKET_BYTES_MAX
 
 TURN_NS: Final = 10_000_000  # some 80 cycles, and much less than what is taken for a hang
-SETTLE_NS: Final = 1_000_000  # of a turn
+SETTLE_SHARE: Final = 10  # of a turn, the first
 OURS, THEIRS = Turns(TURN_NS, 0), Turns(TURN_NS, 1)
 SENT_MORE: Final = 100  # requests, and half as many as are wanted: for those that are left out
 
@@ -123,6 +125,10 @@ class CycleResult(InRounds, frozen=True):
     ratio_rounds: tuple[float, ...]
 
 
+# What takes turns with others: it measures within the context, and its list is full behind it.
+Side = Callable[[Turns], AbstractContextManager[list[TimedSample]]]
+
+
 class CycleRun(NamedTuple):
     """What is measured: one mechanism in one placement, a run of its own in each round.
 
@@ -139,15 +145,13 @@ class CycleRun(NamedTuple):
         """The cycles of `count` requests (us), after a warm-up. Raises HarnessError."""
         return latencies_us(self._record(count + WARM_UP), skip=WARM_UP)
 
-    def cycles_beside(
-        self, count: int, other: AbstractContextManager[list[TimedSample]]
-    ) -> tuple[list[float], list[float]]:
+    def cycles_beside(self, count: int, other: Side) -> tuple[list[float], list[float]]:
         """The first `count` cycles that `settled` leaves, after a warm-up, and what `other` measured in the
-        turns between those of the load (us). `other` measures within the context, its list is full behind it.
+        turns between those of the load (us).
 
         The latter are none where it was not let run at all. Raises HarnessError.
         """
-        with other as measured:
+        with other(THEIRS) as measured:
             record = self._record(WARM_UP + count + count // 2 + SENT_MORE, OURS)
         cycles = answered(record)
         began_ns, ended_ns = cycles[0].began_ns, cycles[-1].began_ns
@@ -156,13 +160,14 @@ class CycleRun(NamedTuple):
         return [one.us for one in ours], [one.us for one in beside]
 
     @contextlib.contextmanager
-    def in_their_turns(self) -> Iterator[list[TimedSample]]:
-        """Measure without an end: the other side of `cycles_beside`. Raises HarnessError."""
+    def in_turns(self, turns: Turns, skip: int = WARM_UP) -> Iterator[list[TimedSample]]:
+        """A `Side` that leaves out the first `skip` requests. Raises HarnessError."""
         found: list[TimedSample] = []
-        with endless_run(self.ftm, self.placement, pin=self.pin, turns=THEIRS) as run:
+        run_of = partial(endless_run, self.ftm, self.placement, application=self.application, pin=self.pin)
+        with run_of(turns=turns) as run:
             wait_until_ready(run.private)
             yield found
-        found += answered(run.record, skip=WARM_UP)
+        found += answered(run.record, skip=skip)
 
     def _record(self, count: int, turns: Turns | None = None) -> RunRecord:
         return limited_run(
@@ -176,8 +181,23 @@ class CycleRun(NamedTuple):
         )
 
 
+def side_by_side(sides: Sequence[Side], turn_ns: int, seconds: float) -> list[list[float]]:
+    """What each of `sides` measures within `seconds`, in turns of `turn_ns` (us). Raises HarnessError."""
+    turns = [Turns(turn_ns, number, len(sides)) for number in range(len(sides))]
+    with contextlib.ExitStack() as stack:
+        measured = [stack.enter_context(side(its)) for side, its in zip(sides, turns, strict=True)]
+        time.sleep(WARM_UP_SECONDS)
+        began_ns = time.monotonic_ns()
+        time.sleep(seconds)
+        ended_ns = time.monotonic_ns()
+    return [
+        [one.us for one in settled((one for one in of if began_ns <= one.began_ns < ended_ns), its, 1)]
+        for of, its in zip(measured, turns, strict=True)
+    ]
+
+
 def settled(measured: Iterable[TimedSample], turns: Turns, least: int) -> list[TimedSample]:
-    """Those that began in one of `turns`, behind its first `SETTLE_NS`, and ended within it.
+    """Those that began in one of `turns`, behind its first tenth, and ended within it.
 
     All, if these are fewer than `least`: on a machine so busy hardly anything ends within a turn.
     """
@@ -185,7 +205,8 @@ def settled(measured: Iterable[TimedSample], turns: Turns, least: int) -> list[T
     found = [
         one
         for one in everything
-        if not turns.left_ns(one.began_ns) and SETTLE_NS <= one.began_ns % turns.ns < turns.ns - one.us * 1e3
+        if not turns.left_ns(one.began_ns)
+        and turns.ns // SETTLE_SHARE <= one.began_ns % turns.ns < turns.ns - one.us * 1e3
     ]
     return found if len(found) >= least else everything
 
@@ -201,7 +222,7 @@ def bench_cycle(
     found = _in_rounds(
         ours,
         shares(count, rounds),
-        partial(ring_in_their_turns, shape, size, pin=ours.pin),
+        partial(ring_in_turns, shape, size, pin=ours.pin),
         partial(ring_us, shape, size, pin=ours.pin),
         show,
     )
@@ -229,7 +250,7 @@ def bench_cycle(
 def _in_rounds(
     ours: CycleRun,
     share: list[int],
-    in_their_turns: Callable[[], AbstractContextManager[list[TimedSample]]],
+    other: Side,
     limit_us: Callable[[int], list[float]],
     show: Show,
 ) -> Rounds[list[float], list[float]]:
@@ -241,7 +262,7 @@ def _in_rounds(
             lambda number: limit_us(share[number]),
             show=show,
         )
-    return together(len(share), lambda number: ours.cycles_beside(share[number], in_their_turns()), show)
+    return together(len(share), lambda number: ours.cycles_beside(share[number], other), show)
 
 
 class CycleBesideResult(InRounds, frozen=True):
@@ -261,7 +282,7 @@ def bench_cycle_beside(
     """`count` requests in rounds, in turn with as many of `other`."""
     for side in (ours, other):
         build(side.ftm, side.placement)  # refuses what there is none of, before anything is measured
-    found = _in_rounds(ours, shares(count, rounds), other.in_their_turns, other.cycles_us, show)
+    found = _in_rounds(ours, shares(count, rounds), other.in_turns, other.cycles_us, show)
     name = f"cycle under {other.ftm}, {other.placement}"
     beside = beside_limit(name, found.figures, found.limits, 1)
     cycles = list(itertools.chain.from_iterable(found.figures))
@@ -350,8 +371,10 @@ def ring_us(
 
 
 @contextlib.contextmanager
-def ring_in_their_turns(shape: RingShape, packet_bytes: int, *, pin: bool) -> Iterator[list[TimedSample]]:
-    """Turn a ring from a process of its own: the other side of `CycleRun.cycles_beside`.
+def ring_in_turns(
+    shape: RingShape, packet_bytes: int, turns: Turns, *, pin: bool, work: RingWork | None = None
+) -> Iterator[list[TimedSample]]:
+    """A `Side` that turns a ring, from a process of its own.
 
     Raises HarnessError if a packet does not come back.
     """
@@ -360,7 +383,7 @@ def ring_in_their_turns(shape: RingShape, packet_bytes: int, *, pin: bool) -> It
     with ours:
         ours.settimeout(2 * TURN_SECONDS_MAX)
         with theirs:
-            serve = partial(_turn_until_told, theirs, shape, packet_bytes, pin=pin)
+            serve = partial(_turn_until_told, theirs, shape, packet_bytes, turns, pin=pin, work=work)
             child = _forked(os.getpid(), cores(pin=pin)[0], [ours, theirs], [theirs], serve)
         data = array("q")
         try:
@@ -379,12 +402,20 @@ def ring_in_their_turns(shape: RingShape, packet_bytes: int, *, pin: bool) -> It
     ]
 
 
-def _turn_until_told(line: socket.socket, shape: RingShape, packet_bytes: int, *, pin: bool) -> None:
-    """Turn a ring in `THEIRS` until the line ends; then send when each turn began, and its time (ns)."""
+def _turn_until_told(
+    line: socket.socket,
+    shape: RingShape,
+    packet_bytes: int,
+    turns: Turns,
+    *,
+    pin: bool,
+    work: RingWork | None,
+) -> None:
+    """Turn a ring in `turns` until the line ends; then send when each turn began, and its time (ns)."""
     taken = array("q")
-    with _ring(shape, packet_bytes, pin=pin) as turn_us:
-        while not linux.readable((line.fileno(),), THEIRS.left_ns(time.monotonic_ns()) / 1e9):
-            while not THEIRS.left_ns(began_ns := time.monotonic_ns()):
+    with _ring(shape, packet_bytes, pin=pin, work=work) as turn_us:
+        while not linux.readable((line.fileno(),), turns.left_ns(time.monotonic_ns()) / 1e9):
+            while not turns.left_ns(began_ns := time.monotonic_ns()):
                 taken.extend((began_ns, round(turn_us() * 1e3)))
     line.sendall(taken.tobytes())
 

@@ -1,12 +1,13 @@
 """From SIGKILL of the primary to the next good reply, in a closed loop: one request always waits.
 
 Each kill takes the whole replica (all nodes of its chain), as the crash of an ECU would. The next kill
-waits until redundancy is back. Times are from the journals, whose clock is common to all processes.
+waits until redundancy is back, and until the spares that it took are forked anew, which takes both cores for
+a tenth of a second. Times are from the journals, whose clock is common to all processes.
 
 `death_ms` is the limit of any detection: from SIGKILL of a process to the moment at which another one that
 polls its pidfd sees that it is dead. The victim runs as a node of the leader's chain does, the other one as
-a Watchdog does. Kills and deaths alternate: before each kill, when redundancy is back, the load pauses for a
-turn of `TURN_NS`, and in it a death is measured.
+a Watchdog does. Kills and deaths alternate: the load pauses in every third turn of `TURN_NS`. When all is
+back, a death is measured in such a turn, and the kill comes soon behind it.
 """
 
 import os
@@ -20,7 +21,14 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from aftbed.bench.rounds import ROUNDS, InRounds, become_node, beside_limit, cores, shares, together
-from aftbed.bench.runs import POLL_SECONDS, Percentiles, endless_run, percentiles, wait_for
+from aftbed.bench.runs import (
+    POLL_SECONDS,
+    Percentiles,
+    endless_run,
+    percentiles,
+    wait_for,
+    wait_until_at_rest,
+)
 from aftbed.core.errors import HarnessError
 from aftbed.core.progress import Show, unshown
 from aftbed.inject.crash import Crash
@@ -33,9 +41,8 @@ from aftbed.runtime.unix.options import Turns
 REDUNDANCY_SECONDS_MAX: Final = 5.0
 PAUSE_SECONDS: Final = 0.01  # of undisturbed service before a kill
 DEATH_SECONDS_MAX: Final = 5.0
-DEATHS_MIN: Final = 5  # in a round of adaptations
 TURN_NS: Final = 40_000_000  # a death takes half of it, with its forks, and a client that waits is not hung
-OURS, THEIRS = Turns(TURN_NS, 0), Turns(TURN_NS, 1)
+OF_LOAD, OF_DEATHS = Turns(TURN_NS, 0, 3, 2), Turns(TURN_NS, 2, 3)
 DEATH: Final = "SIGKILL to a pidfd readable elsewhere"
 PARTS: Final = ("detection", "fencing", "promotion", "first_reply")
 
@@ -89,14 +96,11 @@ def _recoveries_and_deaths(
 ) -> tuple[list[_Recovery], list[float]]:
     """Of a run whose primary is killed so often, and as many deaths (ms) in between."""
     deaths_ms = []
-    with endless_run(ftm, placement, pin=pin, turns=OURS) as run:
+    with endless_run(ftm, placement, pin=pin, turns=OF_LOAD) as run:
         epoch = 0
         for _ in range(kills):
             epoch = _redundant_epoch(run.private, epoch)
-            for turns in (OURS, THEIRS):
-                _sleep_until(turns)
-            deaths_ms.append(death_ms(pin=pin))
-            _sleep_until(OURS)
+            deaths_ms.append(death_at_rest_ms(run.private, pin=pin))
             time.sleep(PAUSE_SECONDS)
             control_client.ask(
                 run.private, control_client.InjectCommand(Fault(Crash(), "primary", Trigger()))
@@ -114,6 +118,19 @@ def _recoveries_and_deaths(
     return found, deaths_ms
 
 
+def death_at_rest_ms(private: Path, *, pin: bool) -> float:
+    """A death (ms) while a run whose load sends `OF_LOAD` has nothing to do; returns when the load goes on.
+
+    Raises HarnessError.
+    """
+    wait_until_at_rest(private)
+    for turns in (OF_LOAD, OF_DEATHS):
+        _sleep_until(turns)
+    found_ms = death_ms(pin=pin)
+    _sleep_until(OF_LOAD)
+    return found_ms
+
+
 def _sleep_until(turns: Turns) -> None:
     """Return in one of them."""
     time.sleep(turns.left_ns(time.monotonic_ns()) / 1e9)
@@ -129,11 +146,6 @@ def _redundant_epoch(private: Path, after: int) -> int:
         return int(str(status["epoch"])) > after and bool(status["backup"]) and not status["busy"]
 
     return int(str(wait_for(private, reached, REDUNDANCY_SECONDS_MAX, "redundancy")["epoch"]))
-
-
-def deaths_ms(count: int, *, pin: bool) -> list[float]:
-    """Of so many processes, and at least of DEATHS_MIN. Raises HarnessError."""
-    return [death_ms(pin=pin) for _ in range(max(count, DEATHS_MIN))]
 
 
 def death_ms(*, pin: bool = True) -> float:

@@ -27,16 +27,18 @@ from typing import Final, NamedTuple
 import msgspec
 
 from aftbed.bench.cycle import ring_p50_us
-from aftbed.bench.rounds import BesideLimit, InRounds, MachineWatch, Meanwhile, beside_limit, in_turn
+from aftbed.bench.rounds import ROUNDS, BesideLimit, InRounds, MachineWatch, Meanwhile, beside_limit, in_turn
 from aftbed.bench.runs import (
     STOPPED,
     Percentiles,
+    cpu_ns,
     endless_run,
     finished,
     latencies_us,
     percentiles,
     run_python,
     wait_for,
+    wait_until_at_rest,
     wait_until_ready,
 )
 from aftbed.campaign.statistics import quantile
@@ -45,7 +47,7 @@ from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.core.progress import Show, unshown
 from aftbed.judge.record import RunRecord, read_record
-from aftbed.runtime.unix import control_client, linux
+from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.control_client import ProcessRow, measured
 from aftbed.runtime.unix.interrupts import scratch_directory
 from aftbed.runtime.unix.launch import launch, options_for
@@ -56,12 +58,12 @@ IDLE_HZ: Final = 1.0
 WINDOW_PERIODS_MIN: Final = 1.2
 START_SECONDS_MAX: Final = 10.0
 IDLE_SECONDS: Final = 3.0  # of a run that has nothing to do
-REST_SECONDS_MAX: Final = 10.0  # until its spares have been forked
-LOOK_SECONDS: Final = 0.1  # between two looks whether they have
 SETTLE_SECONDS: Final = 1.5  # of driving before the look, so that the pages that work touches are counted
 ASLEEP_PERCENT: Final = 0.5  # of one core: a node below it does almost nothing
 NO_CRASH: Final = "single"  # the placement in which both replicas die at once
 RUN_SECONDS_MAX: Final = 30.0
+DRIVE: Final = ("--pace", "max", "--scenario", "free-drive", "--duration", "500ms")  # to the first reply
+START_RUNS: Final = 4 * ROUNDS  # the times of two imports differ by a third
 # Without asammdf, which a run does not import either, wherever it is installed.
 IMPORTS: Final = "from aftbed.vehicle.can import python_can; import cantools, msgspec, typer"
 HELP_IMPORTS: Final = "import typer"
@@ -150,22 +152,6 @@ def bench_memory(ftm: str, placement: str, show: Show = unshown) -> MemoryResult
     return MemoryResult(ftm, placement, len(nodes), *sizes, idle.cpu_percent, others, watch.found())
 
 
-def wait_until_at_rest(private: Path) -> None:
-    """Until the zygotes and spares of a load sleep, and have not run since the look before.
-
-    Spares are still forked when the graph serves. Raises HarnessError if they do not come to rest.
-    """
-    limit_s, before = time.monotonic() + REST_SECONDS_MAX, None
-    while time.monotonic() < limit_s:
-        rows = [row for row in control_client.processes(private) if not row.node]
-        asleep, used_ns = all(linux.state_of(row.pid) == "S" for row in rows), _cpu_ns(rows)
-        if asleep and used_ns == before:
-            return
-        before = used_ns
-        time.sleep(LOOK_SECONDS)
-    raise HarnessError(f"zygotes and spares were not at rest within {REST_SECONDS_MAX:g} s")
-
-
 def process_count(ftm: str, placement: str) -> int:
     """The nodes and the supervisor of a run that serves: the paper's count."""
     with endless_run(ftm, placement, RADAR_HZ) as run:
@@ -212,9 +198,9 @@ def _silence(record: RunRecord, began_ns: int, ended_ns: int) -> str:
 def _usage(private: Path, seconds: float) -> tuple[Usage, int, int]:
     """The usage of the run in the next `seconds`; and when that began and ended (monotonic ns)."""
     rows = control_client.processes(private)
-    before, began_ns = _cpu_ns(rows), time.monotonic_ns()
+    before, began_ns = cpu_ns(rows), time.monotonic_ns()
     time.sleep(seconds)  # the measured window
-    after, ended_ns = _cpu_ns(rows), time.monotonic_ns()
+    after, ended_ns = cpu_ns(rows), time.monotonic_ns()
     shares = {pid: 100 * (after[pid] - before[pid]) / (ended_ns - began_ns) for pid in after if pid in before}
     nodes = [row for row in rows if row.node]
     if missing := [row.name for row in nodes if row.pid not in shares]:
@@ -236,19 +222,6 @@ def _usage(private: Path, seconds: float) -> tuple[Usage, int, int]:
 
 def _sum(values: dict[int, float], rows: list[ProcessRow], digits: int) -> float:
     return round(sum(values.get(row.pid, 0.0) for row in rows), digits)
-
-
-def _cpu_ns(rows: list[ProcessRow]) -> dict[int, int]:
-    """The CPU time of each process that is still there; each has one thread."""
-    found = {}
-    for row in rows:
-        try:
-            found[row.pid] = int(Path(f"/proc/{row.pid}/schedstat").read_text().split()[0])
-        except (FileNotFoundError, ProcessLookupError):
-            continue
-    if rows and not found:
-        raise HarnessError("no /proc/PID/schedstat: this kernel reports no CPU times (CONFIG_SCHED_INFO)")
-    return found
 
 
 # -- start ----------------------------------------------------------------------------------------
@@ -329,10 +302,8 @@ def _launched_ms(ftm: str, placement: str) -> tuple[float, float]:
     with scratch_directory("aftbed-bench-") as folder:
         directory = folder / "record"
         began_ns = time.monotonic_ns()
-        arguments = ["-m", "aftbed", "run", "--ftm", ftm, "--placement", placement, "--pace", "max"]
-        run_python(
-            [*arguments, "--scenario", "ccrs-20", "--record", str(directory), "--json"], RUN_SECONDS_MAX
-        )
+        arguments = ["-m", "aftbed", "run", "--ftm", ftm, "--placement", placement, *DRIVE]
+        run_python([*arguments, "--record", str(directory), "--json"], RUN_SECONDS_MAX)
         dialogue = read_record(directory).history.dialogue
         first_ns = next((e.t_ns for e in dialogue if e.kind is EntryKind.ANSWERED), None)
         if first_ns is None:

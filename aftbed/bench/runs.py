@@ -18,7 +18,9 @@ from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.events import Event
 from aftbed.functions.request_file import GivenRequests
 from aftbed.judge.record import RunRecord, read_record
+from aftbed.runtime.run_controller import RESTOCK_SECONDS
 from aftbed.runtime.unix import control_client, interrupts, linux
+from aftbed.runtime.unix.control_client import ProcessRow
 from aftbed.runtime.unix.launch import Launched, launch, options_for
 from aftbed.runtime.unix.options import LoadRun, Turns
 
@@ -26,6 +28,8 @@ REQUESTS_ENDLESS: Final = 10_000_000
 READY_SECONDS_MAX: Final = 10.0
 POLL_SECONDS: Final = 0.005
 PAUSE_SECONDS: Final = 0.05  # of undisturbed service, between two things that are measured
+REST_SECONDS_MAX: Final = 10.0  # until the spares of a run have been forked
+LOOK_SECONDS: Final = RESTOCK_SECONDS + 0.01  # between two looks whether they have
 STOPPED: Final = ("interrupted", "")  # how an endless run may end
 TRIES: Final = 3
 CHILD_END_SECONDS_MAX: Final = 0.7  # of a command that is interrupted; then its warden cleans up
@@ -232,6 +236,35 @@ def wait_until_ready(private: Path) -> None:
     """Until the run serves with all its replicas. Raises HarnessError."""
     wait_for(private, lambda status: not status["busy"], READY_SECONDS_MAX, "service")
     time.sleep(PAUSE_SECONDS)
+
+
+def wait_until_at_rest(private: Path) -> None:
+    """Until the zygotes and spares of a load sleep, and have not run since the look before.
+
+    Spares are still forked when the graph serves. Raises HarnessError if they do not come to rest.
+    """
+    limit_s, before = time.monotonic() + REST_SECONDS_MAX, None
+    while time.monotonic() < limit_s:
+        rows = [row for row in control_client.processes(private) if not row.node]
+        asleep, used_ns = all(linux.state_of(row.pid) == "S" for row in rows), cpu_ns(rows)
+        if asleep and used_ns == before:
+            return
+        before = used_ns
+        time.sleep(LOOK_SECONDS)
+    raise HarnessError(f"zygotes and spares were not at rest within {REST_SECONDS_MAX:g} s")
+
+
+def cpu_ns(rows: list[ProcessRow]) -> dict[int, int]:
+    """The CPU time of each process that is still there; each has one thread."""
+    found = {}
+    for row in rows:
+        try:
+            found[row.pid] = int(Path(f"/proc/{row.pid}/schedstat").read_text().split()[0])
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+    if rows and not found:
+        raise HarnessError("no /proc/PID/schedstat: this kernel reports no CPU times (CONFIG_SCHED_INFO)")
+    return found
 
 
 class TimedSample(NamedTuple):

@@ -2,8 +2,12 @@
 
 A function with ballast (`ballast`) replaces the built-in one by an update, and then two versions of it
 replace each other. This moves the whole state on both replicas while the client waits: that is the
-blackout. The cycle is measured in a closed loop after the last update. Under `pbr` the state goes into each
-checkpoint; under `lfr` it never leaves its replica, except for an update.
+blackout. Under `pbr` the state goes into each checkpoint; under `lfr` it never leaves its replica, except for
+an update.
+
+`bench_state` measures a cycle side by side (`cycle`): a run with each of two sizes and the limit live at the
+same time, and every third turn is that of one of them. A turn is longer where a cycle takes milliseconds.
+Updates are measured before, in runs of their own, one size in turn with the other.
 
 The limit of a cycle under a state is the bare ring (`cycle`), with what the machine allows for the state.
 Its process in the leader's place copies as many bytes into a memfd as are captured for a checkpoint, compares
@@ -20,6 +24,8 @@ import mmap
 import os
 import time
 from collections.abc import Callable, Iterable
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -28,8 +34,17 @@ import msgspec
 from aftbed.adapt.planner import APPLICATION
 from aftbed.bench import ballast
 from aftbed.bench.adaptation import adapted
-from aftbed.bench.cycle import RING_BYTES, RingWork, ring_of, ring_p50_us, ring_us
-from aftbed.bench.rounds import ROUNDS, InRounds, beside_limit, in_turn
+from aftbed.bench.cycle import (
+    RING_BYTES,
+    TURN_NS,
+    CycleRun,
+    RingWork,
+    ring_in_turns,
+    ring_of,
+    ring_p50_us,
+    side_by_side,
+)
+from aftbed.bench.rounds import ROUNDS, InRounds, beside_limit, together
 from aftbed.bench.runs import (
     PAUSE_SECONDS,
     Percentiles,
@@ -49,9 +64,10 @@ from aftbed.ftm.registry import BRICKS
 
 PLACEMENT: Final = "process"
 REPLIES_MIN: Final = 5
-UPDATES: Final = 2  # in a round
-WINDOW_SECONDS: Final = 0.5  # of a closed loop in a round
-RING_COUNT, RING_WARM_UP = 100, 20  # turns in a round
+UPDATES: Final = 4  # in a round
+SECONDS: Final = 3.0  # of a round, in which cycles are measured
+TURN_BYTES_PER_NS: Final = 0.1  # of a state: a cycle of 1 MB fits twenty times into its turn
+TURN_NS_MAX: Final = 40_000_000  # a client that waits for two turns is not taken for hung
 _AROUND_BYTES: Final = 1024  # of a message, beside the state in it
 
 
@@ -111,7 +127,7 @@ def bench_state(
     rounds: int = ROUNDS,
     show: Show = unshown,
 ) -> StateRatio:
-    """A function of each size in turn: its cycle in a closed loop, and the blackout of updates to it.
+    """A function of each size: its cycle in a closed loop, and the blackout of updates to it.
 
     One page changes with each request. `tracked`: the function tells its changes. Raises HarnessError.
     """
@@ -119,38 +135,40 @@ def bench_state(
     moved_bytes = captured_bytes(ftm, size_bytes, tracked=tracked)
     work = state_work(moved_bytes) if moved_bytes else None
 
-    def both(number: int) -> tuple[_Window, _Window]:
-        sizes = (beside_bytes, size_bytes)
-        first, second = (
-            _window(ftm, size, UPDATES, WINDOW_SECONDS, tracked=tracked)
-            for size in (sizes if number % 2 == 0 else reversed(sizes))
-        )
-        return (first, second) if number % 2 == 0 else (second, first)
-
-    def limit(number: int) -> list[float]:
-        return ring_us(shape, RING_BYTES, RING_COUNT, warm_up=RING_WARM_UP, work=work)
-
-    found = in_turn(rounds, both, limit, show=show)
-    small, large = ([one[n] for one in found.figures] for n in range(2))
-    beside_cycles, cycles = ([us for one in windows for us in one.cycles_us] for windows in (small, large))
-    beside_blackout, blackout = (
-        percentiles([ms for one in windows for ms in one.blackouts_ms]) for windows in (small, large)
-    )
-    ratios = [
-        quantile(one.cycles_us, 0.5) / quantile(other.cycles_us, 0.5)
-        for one, other in zip(large, small, strict=True)
+    turn_ns = round(min(max(TURN_NS, moved_bytes / TURN_BYTES_PER_NS), TURN_NS_MAX))
+    runs = [
+        CycleRun(ftm, PLACEMENT, application=ballast.source_of(size, ballast.VERSIONS[0], tracked=tracked))
+        for size in (size_bytes, beside_bytes)
     ]
+    sides = [
+        *(partial(run.in_turns, skip=0) for run in runs),
+        partial(ring_in_turns, shape, RING_BYTES, pin=True, work=work),
+    ]
+
+    def measured(number: int) -> tuple[_Round, list[float]]:
+        first = number % 2
+        sizes = (size_bytes, beside_bytes)
+        blackouts = [_blackouts_ms(ftm, size, tracked=tracked) for size in (sizes[first], sizes[1 - first])]
+        large, small, ring = side_by_side(sides, turn_ns, SECONDS)
+        return _Round(large, small, blackouts[first], blackouts[1 - first]), ring
+
+    found = together(rounds, measured, show)
+    large, small, large_ms, small_ms = zip(*found.figures, strict=True)
     name = shape.name + f", memcpy of {moved_bytes} bytes through memfds" * bool(moved_bytes)
-    beside = beside_limit(name, [one.cycles_us for one in large], found.limits, 1)
+    beside, beside_small = beside_limit(name, large, found.limits, 1), beside_limit("", large, small, 1)
+    blackout, beside_blackout = (percentiles(list(chain.from_iterable(ms))) for ms in (large_ms, small_ms))
     return StateRatio(
         ftm,
         size_bytes,
         beside_bytes,
         tracked,
-        percentiles(cycles, 1),
-        percentiles(beside_cycles, 1),
-        round(quantile(ratios, 0.5), 3),
-        tuple(round(ratio, 3) for ratio in ratios),
+        percentiles(list(chain.from_iterable(large)), 1),
+        percentiles(list(chain.from_iterable(small)), 1),
+        beside_small.ratio.p50.median,
+        tuple(
+            round(quantile(one, 0.5) / quantile(other, 0.5), 3)
+            for one, other in zip(large, small, strict=True)
+        ),
         blackout,
         beside_blackout,
         round(blackout.p50 / beside_blackout.p50, 3),
@@ -158,6 +176,21 @@ def bench_state(
         ratio=beside.ratio,
         machine=found.machine,
     )
+
+
+class _Round(NamedTuple):
+    """Of both sizes: the cycles (us), and the blackouts of updates (ms)."""
+
+    cycles_us: list[float]
+    beside_cycles_us: list[float]
+    blackouts_ms: list[float]
+    beside_blackouts_ms: list[float]
+
+
+def _blackouts_ms(ftm: str, size_bytes: int, *, tracked: bool) -> list[float]:
+    with endless_run(ftm, PLACEMENT) as run:
+        outcomes = _updates(run.private, size_bytes, UPDATES, tracked=tracked)
+    return [float(str(outcome["blackout_ms"])) for outcome in outcomes]
 
 
 def captured_bytes(ftm: str, size_bytes: int, *, tracked: bool) -> int:
@@ -245,9 +278,9 @@ class _Window(NamedTuple):
     totals_ms: list[float]
 
 
-def _window(ftm: str, size_bytes: int, updates: int, seconds: float, *, tracked: bool = False) -> _Window:
+def _window(ftm: str, size_bytes: int, updates: int, seconds: float) -> _Window:
     with endless_run(ftm, PLACEMENT) as run:
-        outcomes = _updates(run.private, size_bytes, updates, tracked=tracked)
+        outcomes = _updates(run.private, size_bytes, updates)
         began_ns = time.monotonic_ns()
         time.sleep(seconds)  # the measured window
         ended_ns = time.monotonic_ns()

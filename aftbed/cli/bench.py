@@ -14,9 +14,9 @@ import typer
 
 from aftbed.bench import ballast
 from aftbed.bench.adaptation import bench_adapt
-from aftbed.bench.cycle import CYCLE_ROUNDS, CycleRun, bench_cycle, bench_cycle_beside, bench_hops
+from aftbed.bench.cycle import CYCLE_ROUNDS, CYCLES, CycleRun, bench_cycle, bench_cycle_beside, bench_hops
 from aftbed.bench.recovery import bench_recovery
-from aftbed.bench.resources import bench_launch, bench_memory
+from aftbed.bench.resources import START_RUNS, bench_launch, bench_memory
 from aftbed.bench.rounds import ROUNDS, SHORT_ROUNDS, text
 from aftbed.cli.interrupted import told_if_interrupted
 from aftbed.cli.options import App, Ftm, Json, Recipe, check_range, choices, print_json
@@ -46,7 +46,7 @@ Pin = Annotated[bool, typer.Option(help="Keep each replica's chain on one core."
 def cycle(
     ftm: Ftm = "pbr",
     placement: Placement = "process",
-    count: Count = REQUESTS_MIN,
+    count: Count = CYCLES,
     app: App = None,
     requests: Annotated[
         str | None, typer.Option(help="What --app is sent: FILE (CSV, JSON lines) or MODULE:FUNCTION.")
@@ -116,7 +116,7 @@ def adapt(
     ] = 0,
     placement: Placement = "process",
     recipe: Recipe = "drained",
-    adaptations: Annotated[int, typer.Option(min=1, help="There; as many lead back.")] = 55,
+    adaptations: Annotated[int, typer.Option(min=1, help="There; as many lead back.")] = 110,
     pin: Pin = True,
     rounds: Rounds = ROUNDS,
     json: Json = False,
@@ -148,7 +148,7 @@ def adapt(
 def launch(
     ftm: Ftm = "pbr",
     placement: Placement = "process",
-    runs: Annotated[int, typer.Option(min=1, help="Each is a round with its limit.")] = ROUNDS,
+    runs: Annotated[int, typer.Option(min=1, help="Each is a round with its limit.")] = START_RUNS,
     json: Json = False,
 ) -> None:
     """From the start of `aftbed run` to the first reply, the graph alone, and the page of --help."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from aftbed.bench import resources
+from aftbed.bench import runs
 from aftbed.core.errors import HarnessError
 from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.control_client import ProcessRow
@@ -30,10 +30,10 @@ def spare(code: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def test_a_run_is_at_rest_when_its_spares_sleep(monkeypatch: pytest.MonkeyPatch) -> None:
     with spare(SLEEPS, monkeypatch):
-        resources.wait_until_at_rest(Path())
+        runs.wait_until_at_rest(Path())
 
 
 def test_a_run_whose_spares_are_still_at_work_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resources, "REST_SECONDS_MAX", 0.5)
+    monkeypatch.setattr(runs, "REST_SECONDS_MAX", 0.5)
     with spare(WORKS, monkeypatch), pytest.raises(HarnessError, match=r"not at rest within 0\.5 s"):
-        resources.wait_until_at_rest(Path())
+        runs.wait_until_at_rest(Path())

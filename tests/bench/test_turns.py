@@ -1,6 +1,9 @@
 """A run and its limit that take turns on one clock: which may begin when, and what is left out."""
 
+import contextlib
 import time
+from collections.abc import Iterator
+from functools import partial
 
 import psutil
 import pytest
@@ -10,13 +13,15 @@ from hypothesis import strategies as st
 
 from aftbed.bench.cycle import (
     OURS,
-    SETTLE_NS,
+    SETTLE_SHARE,
     THEIRS,
     TURN_NS,
     CycleRun,
     RingShape,
-    ring_in_their_turns,
+    Side,
+    ring_in_turns,
     settled,
+    side_by_side,
 )
 from aftbed.bench.runs import TimedSample, limited_run
 from aftbed.core.errors import HarnessError
@@ -24,14 +29,22 @@ from aftbed.core.journal import EntryKind
 from aftbed.runtime.unix.options import Turns
 
 RING = RingShape(4, ((2, "b"),))
+SETTLE_NS = TURN_NS // SETTLE_SHARE
 
 
-@given(st.integers(1, 10**9), st.integers(0, 10**18))
-def test_at_each_moment_one_of_two_may_begin_and_the_other_knows_when(ns: int, now_ns: int) -> None:
-    first, second = Turns(ns, 0).left_ns(now_ns), Turns(ns, 1).left_ns(now_ns)
-    assert min(first, second) == 0 < max(first, second) <= ns
-    later_ns = now_ns + max(first, second)
-    assert (Turns(ns, 0).left_ns(later_ns) == 0) == (first > 0)
+@given(st.integers(1, 10**9), st.integers(0, 10**18), st.integers(2, 5), st.data())
+def test_at_each_moment_one_may_begin_and_the_others_know_when(
+    ns: int, now_ns: int, of: int, data: st.DataObject
+) -> None:
+    first = data.draw(st.integers(1, of - 1), "the share of the first")
+    sides = [Turns(ns, 0, of, first), *(Turns(ns, number, of) for number in range(first, of))]
+    left_ns = sorted(side.left_ns(now_ns) for side in sides)
+    assert left_ns[0] == 0 < left_ns[1] <= first * ns  # one of them, and the next
+    for side in sides:
+        begins_ns = now_ns + side.left_ns(now_ns)
+        assert side.left_ns(begins_ns) == 0
+        if begins_ns > now_ns:
+            assert side.left_ns(begins_ns - 1) == 1
 
 
 def test_the_begin_of_a_turn_and_what_outlasts_it_are_left_out() -> None:
@@ -51,7 +64,7 @@ def test_where_too_few_end_within_a_turn_all_count() -> None:
 
 @pytest.mark.process
 def test_a_load_sends_in_its_turns_only(home: Home) -> None:
-    for turns in (OURS, THEIRS):
+    for turns in (OURS, THEIRS, Turns(TURN_NS, 0, 3, 2)):
         record = limited_run("none", "single", 1000, pin=True, turns=turns)
         sent = [entry for entry in record.history.dialogue if entry.kind is EntryKind.SENT]
         assert len(sent) == 1000 and all(turns.left_ns(entry.t_ns) == 0 for entry in sent)
@@ -59,9 +72,10 @@ def test_a_load_sends_in_its_turns_only(home: Home) -> None:
 
 @pytest.mark.process
 def test_a_cycle_and_its_ring_are_measured_side_by_side(home: Home) -> None:
-    with ring_in_their_turns(RING, 64, pin=True) as ring:
+    side = partial(ring_in_turns, RING, 64, pin=True)
+    with side(THEIRS) as ring:
         began_ns = time.monotonic_ns()
-        cycles, beside = CycleRun("pbr", "replica").cycles_beside(60, ring_in_their_turns(RING, 64, pin=True))
+        cycles, beside = CycleRun("pbr", "replica").cycles_beside(60, side)
         ended_ns = time.monotonic_ns()
     assert len(cycles) == 60 and min(cycles) > 0
     assert beside and min(beside) > 0
@@ -70,11 +84,33 @@ def test_a_cycle_and_its_ring_are_measured_side_by_side(home: Home) -> None:
 
 
 @pytest.mark.process
+def test_three_sides_are_measured_in_one_time_each_in_its_own_turns(home: Home) -> None:
+    given: list[Turns] = []
+    began: list[list[TimedSample]] = []
+
+    @contextlib.contextmanager
+    def noted(side: Side, turns: Turns) -> Iterator[list[TimedSample]]:
+        given.append(turns)
+        with side(turns) as measured:
+            began.append(measured)
+            yield measured
+
+    run, ring = CycleRun("pbr", "replica"), partial(ring_in_turns, RING, 64, pin=True)
+    found = side_by_side([partial(noted, side) for side in (run.in_turns, ring, ring)], 2 * TURN_NS, 0.3)
+    assert given == [Turns(2 * TURN_NS, number, 3) for number in range(3)]
+    for us, measured, turns in zip(found, began, given, strict=True):
+        assert us and set(us) <= {one.us for one in measured}
+        assert len(us) < len(measured)  # without the warm-up
+        own = [one for one in measured if not turns.left_ns(one.began_ns)]
+        assert len(own) > len(measured) / 2 and set(us) <= {one.us for one in own}
+
+
+@pytest.mark.process
 def test_a_ring_that_dies_ends_the_measurement(home: Home) -> None:
     before = set(psutil.Process().children())
     with (
         pytest.raises(HarnessError, match="the bare ring: one of its processes died"),
-        ring_in_their_turns(RING, 64, pin=True),
+        ring_in_turns(RING, 64, THEIRS, pin=True),
     ):
         (ring,) = set(psutil.Process().children()) - before
         ring.kill()

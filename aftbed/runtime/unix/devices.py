@@ -120,9 +120,10 @@ class BusLink(CarLink):
 
 
 class LoadInTurns(Load):
-    """A closed loop that sends a request only in one of its turns.
+    """Sends a request only in one of its turns.
 
-    Until that begins it sleeps, and its node with it: a turn is far shorter than what is taken for a hang.
+    A closed loop sleeps until that begins, and its node with it: the turns of others are far shorter than
+    what is taken for a hang. At a rate, what would be due in them is left out.
     """
 
     def __init__(
@@ -131,13 +132,17 @@ class LoadInTurns(Load):
         dialogue: Dialogue,
         requests: list[bytes],
         count: int,
+        rate_hz: float,
         turns: Turns,
         on_end: Callable[[], None],
     ) -> None:
-        super().__init__(client, dialogue, requests, count, 0.0, on_end)
+        super().__init__(client, dialogue, requests, count, rate_hz, on_end)
         self._turns = turns
 
     def take(self, now_ns: int) -> Submit | None:
+        if self._period_ns:
+            self._next_ns = max(self._next_ns, now_ns + self._turns.left_ns(now_ns))
+            return super().take(now_ns)
         if self._client.unanswered:
             return None
         while left_ns := self._turns.left_ns(now_ns):  # again where it has slept through a turn
@@ -168,7 +173,7 @@ def make_source(client: Client, options: SourceOptions, on_end: Callable[[], Non
             assert given, f"the requests are no longer in {journals.parent}"
             requests = list(given)
         if work.turns is not None:
-            return LoadInTurns(client, dialogue, requests, work.count, work.turns, on_end)
+            return LoadInTurns(client, dialogue, requests, work.count, work.rate_hz, work.turns, on_end)
         return Load(client, dialogue, requests, work.count, work.rate_hz, on_end)
     # Imported here: the bus costs 150 ms to import, and only the zygote of the bus has it.
     from aftbed.vehicle.can.dbc_file import own_dbc  # noqa: PLC0415

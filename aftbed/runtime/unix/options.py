@@ -19,22 +19,25 @@ PLAYER: Final = "player"
 
 
 class Turns(msgspec.Struct, frozen=True):
-    """Every second turn of `ns` of the monotonic clock: the even ones (`number` 0) or the odd ones (1)."""
+    """Of each `of` turns of `ns` of the monotonic clock, `share` of them from `number` on."""
 
     ns: int
     number: int
+    of: int = 2
+    share: int = 1
 
     def left_ns(self, now_ns: int) -> int:
         """Until the next of these turns begins; 0 within one."""
         turn, into_ns = divmod(now_ns, self.ns)
-        return 0 if turn % 2 == self.number else self.ns - into_ns
+        since = (turn - self.number) % self.of
+        return (self.of - since) * self.ns - into_ns if since >= self.share else 0
 
 
 class LoadRun(msgspec.Struct, frozen=True, tag=True):
     """Requests without a car: drawn from the seed, for benches and tests, or given by the user.
 
-    `requests`, `expect`: what the user named, "" if nothing; the record has what was in them. `turns`: a
-    closed loop sends only in these, and the others are left to what a bench measures beside it.
+    `requests`, `expect`: what the user named, "" if nothing; the record has what was in them. `turns`: it
+    sends only in these, and the others are left to what a bench measures beside it.
     """
 
     count: int
