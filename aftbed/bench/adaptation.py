@@ -10,8 +10,8 @@ replace each other.
 
 The limit is that of a failover, SIGKILL to a pidfd readable elsewhere (`recovery`): no brick can be replaced
 by another process sooner than the kernel takes to tell of the end of one. The two alternate, when the spares
-that the last adaptation took are forked anew: the load pauses for a death, and goes on before the adaptation
-is ordered. Each round has a run of its own.
+that the last adaptation took are forked anew. For a death the load pauses, in every third turn of 40 ms; an
+adaptation is ordered when it goes on. Each round has a run of its own.
 
 The paper's recipe may leave a request in a brick that is killed, and then nothing is served any more. So
 each of its adaptations has a run of its own; those that never answer again are counted as `stuck`.
@@ -31,7 +31,7 @@ from msgspec import Meta
 from aftbed.adapt.planner import APPLICATION, plan
 from aftbed.bench import ballast
 from aftbed.bench.cycle import RING_BYTES, ring_of, ring_us
-from aftbed.bench.recovery import DEATH, OF_LOAD, death_at_rest_ms
+from aftbed.bench.recovery import DEATH, OF_DEATHS, death_at_rest_ms
 from aftbed.bench.rounds import ROUNDS, BesideLimit, Meanwhile, beside_limit, shares, together
 from aftbed.bench.runs import (
     PAUSE_SECONDS,
@@ -59,6 +59,7 @@ from aftbed.judge.record import RunRecord
 from aftbed.runtime.unix import control_client
 
 RATE_HZ: Final = 200.0
+OF_LOAD: Final = msgspec.structs.replace(OF_DEATHS, number=0, share=OF_DEATHS.of - 1)  # all the others
 RING_COUNT: Final = 500
 
 Outcomes = list[dict[str, object]]
@@ -197,7 +198,7 @@ def _there_and_back(ways: Sequence[_Way], count: int, *, pin: bool) -> tuple[_Ro
         wait_until_ready(run.private)
         for _ in range(count):
             for way, outcomes in zip(ways, (found.there, found.back), strict=True):
-                deaths_ms.append(death_at_rest_ms(run.private, pin=pin))
+                deaths_ms.append(death_at_rest_ms(run.private, OF_LOAD, pin=pin))
                 outcomes.append(adapted(run.private, way.goal))
                 time.sleep(PAUSE_SECONDS)
     found.records.append(run.record)
@@ -210,7 +211,7 @@ def _each_in_a_run(way: _Way, count: int, *, pin: bool) -> tuple[_Round, list[fl
     for _ in range(count):
         with _run_of(way, pin=pin) as run:
             wait_until_ready(run.private)
-            deaths_ms.append(death_at_rest_ms(run.private, pin=pin))
+            deaths_ms.append(death_at_rest_ms(run.private, OF_LOAD, pin=pin))
             found.there.append(adapted(run.private, way.goal))
             time.sleep(PAUSE_SECONDS)
         found.records.append(run.record)

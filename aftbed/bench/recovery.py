@@ -6,8 +6,8 @@ a tenth of a second. Times are from the journals, whose clock is common to all p
 
 `death_ms` is the limit of any detection: from SIGKILL of a process to the moment at which another one that
 polls its pidfd sees that it is dead. The victim runs as a node of the leader's chain does, the other one as
-a Watchdog does. Kills and deaths alternate: the load pauses in every third turn of `TURN_NS`. When all is
-back, a death is measured in such a turn, and the kill comes soon behind it.
+a Watchdog does. Kills and deaths alternate: the load sends in every third turn of `TURN_NS`. When all is
+back, a death is measured in the turn before such a one, and the kill comes within it.
 """
 
 import os
@@ -42,7 +42,7 @@ REDUNDANCY_SECONDS_MAX: Final = 5.0
 PAUSE_SECONDS: Final = 0.01  # of undisturbed service before a kill
 DEATH_SECONDS_MAX: Final = 5.0
 TURN_NS: Final = 40_000_000  # a death takes half of it, with its forks, and a client that waits is not hung
-OF_LOAD, OF_DEATHS = Turns(TURN_NS, 0, 3, 2), Turns(TURN_NS, 2, 3)
+OF_LOAD, OF_DEATHS = Turns(TURN_NS, 0, 3), Turns(TURN_NS, 2, 3)  # between them the backup catches up
 DEATH: Final = "SIGKILL to a pidfd readable elsewhere"
 PARTS: Final = ("detection", "fencing", "promotion", "first_reply")
 
@@ -100,7 +100,7 @@ def _recoveries_and_deaths(
         epoch = 0
         for _ in range(kills):
             epoch = _redundant_epoch(run.private, epoch)
-            deaths_ms.append(death_at_rest_ms(run.private, pin=pin))
+            deaths_ms.append(death_at_rest_ms(run.private, OF_LOAD, pin=pin))
             time.sleep(PAUSE_SECONDS)
             control_client.ask(
                 run.private, control_client.InjectCommand(Fault(Crash(), "primary", Trigger()))
@@ -118,16 +118,16 @@ def _recoveries_and_deaths(
     return found, deaths_ms
 
 
-def death_at_rest_ms(private: Path, *, pin: bool) -> float:
-    """A death (ms) while a run whose load sends `OF_LOAD` has nothing to do; returns when the load goes on.
+def death_at_rest_ms(private: Path, of_load: Turns, *, pin: bool) -> float:
+    """A death (ms) in one of `OF_DEATHS`, while a run has nothing to do; returns when its load goes on.
 
     Raises HarnessError.
     """
     wait_until_at_rest(private)
-    for turns in (OF_LOAD, OF_DEATHS):
+    for turns in (of_load, OF_DEATHS):
         _sleep_until(turns)
     found_ms = death_ms(pin=pin)
-    _sleep_until(OF_LOAD)
+    _sleep_until(of_load)
     return found_ms
 
 

@@ -35,7 +35,7 @@ from aftbed.core.progress import Show, unshown
 from aftbed.runtime.unix import interrupts, linux
 
 ROUNDS: Final = 11  # fewer are too few to quote
-SHORT_ROUNDS: Final = 10 * ROUNDS  # of a tenth of a second each, in which a machine may change its speed
+SHORT_ROUNDS: Final = 20 * ROUNDS  # of a tenth of a second each, in which a machine may change its speed
 DIGITS: Final = 3  # of a ratio
 FAILURES_MAX: Final = 3  # of a bench, that are measured again
 

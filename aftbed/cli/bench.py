@@ -203,7 +203,7 @@ def campaign(
 def simulator(
     ftm: Ftm = "pbr",
     placement: Placement = "process",
-    count: Annotated[int, typer.Option(min=100, help="Requests over all rounds.")] = 55_000,
+    count: Annotated[int, typer.Option(min=100, help="Requests over all rounds.")] = 110_000,
     rounds: Rounds = SHORT_ROUNDS,
     json: Json = False,
 ) -> None:
