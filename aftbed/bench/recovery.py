@@ -1,8 +1,8 @@
 """From SIGKILL of the primary to the next good reply, in a closed loop: one request always waits.
 
 Each kill takes the whole replica (all nodes of its chain), as the crash of an ECU would. The next kill
-waits until redundancy is back, and until the spares that it took are forked anew, which takes both cores for
-a tenth of a second. Times are from the journals, whose clock is common to all processes.
+waits until redundancy is back, and until the spares that it took are forked anew, beside which a recovery
+takes up to ten times as long. Times are from the journals, whose clock is common to all processes.
 
 `death_ms` is the limit of any detection: from SIGKILL of a process to the moment at which another one that
 polls its pidfd sees that it is dead. The victim runs as a node of the leader's chain does, the other one as

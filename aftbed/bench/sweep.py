@@ -6,8 +6,9 @@ blackout. Under `pbr` the state goes into each checkpoint; under `lfr` it never 
 an update.
 
 `bench_state` measures a cycle side by side (`cycle`): a run with each of two sizes and the limit live at the
-same time, and every third turn is that of one of them. A turn is longer where a cycle takes milliseconds.
-Updates are measured before, in runs of their own, one size in turn with the other.
+same time, and every third turn is that of one of them. A turn is longer where a cycle takes milliseconds; one
+of more than some 10 MB outlasts its turn, and the others are slower then. Updates are measured before, in
+runs of their own, one size in turn with the other.
 
 The limit of a cycle under a state is the bare ring (`cycle`), with what the machine allows for the state.
 Its process in the leader's place copies as many bytes into a memfd as are captured for a checkpoint, compares
