@@ -1,6 +1,7 @@
 """A run and its limit that take turns on one clock: which may begin when, and what is left out."""
 
 import contextlib
+import itertools
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -23,7 +24,7 @@ from aftbed.bench.cycle import (
     settled,
     side_by_side,
 )
-from aftbed.bench.runs import TimedSample, limited_run
+from aftbed.bench.runs import TimedSample, endless_run, limited_run, wait_for
 from aftbed.core.errors import HarnessError
 from aftbed.core.journal import EntryKind
 from aftbed.runtime.unix.options import Turns
@@ -68,6 +69,21 @@ def test_a_load_sends_in_its_turns_only(home: Home) -> None:
         record = limited_run("none", "single", 1000, pin=True, turns=turns)
         sent = [entry for entry in record.history.dialogue if entry.kind is EntryKind.SENT]
         assert len(sent) == 1000 and all(turns.left_ns(entry.t_ns) == 0 for entry in sent)
+
+
+@pytest.mark.process
+def test_a_load_at_a_rate_leaves_out_what_is_due_in_the_turns_of_others(home: Home) -> None:
+    turns = Turns(4 * TURN_NS, 0, 3, 2)
+    with endless_run("none", "single", 500.0, turns=turns) as run:
+        wait_for(run.private, lambda status: sent_of(status) >= 100, 10, "100 requests")
+    sent_ns = [e.t_ns for e in run.record.history.dialogue if e.kind is EntryKind.SENT]
+    assert not any(map(turns.left_ns, sent_ns))
+    assert any(after - before > turns.ns for before, after in itertools.pairwise(sent_ns))  # a pause
+
+
+def sent_of(status: dict[str, object]) -> int:
+    counts = status["requests"]
+    return int(counts["sent"]) if isinstance(counts, dict) else 0
 
 
 @pytest.mark.process
