@@ -51,11 +51,12 @@ class Ballast:
         """Replace the whole state. Raises PeerError, state unchanged, on another size."""
         if len(state) != self.size_bytes:
             raise PeerError(f"state of {len(state)} bytes, expected {self.size_bytes}")
-        self._state[:] = state
+        memoryview(self._state)[:] = state  # a slice of the bytearray itself would copy twice
 
     def migrate(self, old_state: bytes) -> None:
         """Take the state of a version of the same size; after any other function, start with zeros."""
-        self._state[:] = old_state if len(old_state) == self.size_bytes else bytes(self.size_bytes)
+        fits = len(old_state) == self.size_bytes
+        memoryview(self._state)[:] = old_state if fits else bytes(self.size_bytes)
 
     def acceptable(self, request: bytes, reply: bytes) -> bool:
         """Whether the reply has the size of one."""

@@ -60,6 +60,10 @@ class Channel(Protocol):
         """Wake the reader, so that it looks for orders."""
         ...
 
+    def mail_waits(self) -> bool:
+        """Whether there is a message that the sink has not taken."""
+        ...
+
     def close(self) -> None:
         """Let go of both ends; nodes keep theirs."""
         ...

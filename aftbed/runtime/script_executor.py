@@ -264,6 +264,9 @@ PROMOTE_SECONDS_MAX: Final = 2.0  # nothing else is left to serve
 STEP_SECONDS_MAX: Final = 0.5  # all other steps
 FIRST_REPLY_SECONDS: Final = 0.001
 
+CATCH_UP_SECONDS: Final = 0.001  # between two looks whether a backup is behind
+CATCH_UP_LOOKS: Final = 20
+
 Observe = Callable[[Event, int], Keys]  # called before and after each step of an adaptation, with its number
 
 
@@ -404,6 +407,22 @@ class Execution:
             (at,) = rebinds
             self._rebinding.prepare(to_be_told(tuple(flat(commit[at : at + 1])), self.old, commit[:at]))
         yield from self._deployment.pool.wait_for_forks(LIGHT)
+        yield from self._let_backup_catch_up()
+
+    def _let_backup_catch_up(self) -> Keys:
+        """Wait until the bricks that the commit drains are not behind; the client would wait for it there.
+
+        A backup of a large state can be milliseconds behind. One that stays behind is waited for no longer.
+        """
+        drained = [step.brick for step in flat(self.script.commit) if isinstance(step, Drain)]
+        channels = [one for brick in drained for one in self._deployment.channels.into(brick)]
+        loop = self._runtime.loop
+        for number in range(CATCH_UP_LOOKS):
+            if not any(channel.mail_waits() for channel in channels):
+                return
+            looked: Key = ("looked", "backup", number)
+            loop.after(CATCH_UP_SECONDS, partial(loop.tasks.settle, looked))
+            yield Wait(frozenset({looked}))
 
     def commit(self) -> Keys:
         """All that the client waits for."""

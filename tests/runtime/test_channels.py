@@ -53,6 +53,17 @@ def test_what_was_sent_before_a_fence_stays_readable_and_then_ends(channel: Unix
     assert [channel.read.recv(100) for _ in range(4)] == [b"one", b"two", b"", b""]
 
 
+def test_mail_waits_until_the_sink_takes_it(channel: UnixChannel) -> None:
+    assert not channel.mail_waits()
+    channel.write.send(b"one")
+    channel.write.send(b"two")
+    assert channel.mail_waits()
+    channel.read.recv(100)
+    assert channel.mail_waits()
+    channel.read.recv(100)
+    assert not channel.mail_waits()
+
+
 def test_who_writes_after_a_fence_gets_epipe_through_whichever_descriptor(channel: UnixChannel) -> None:
     of_a_node = os.dup(channel.write.fileno())  # what a node was handed refers to the same socket
     channel.fence()

@@ -12,16 +12,17 @@ from aftbed.judge.simulated import breaches
 from aftbed.runtime.sim.world import Run, Setup, World
 
 MS: Final = 1_000_000
-STOPPED_MS: Final = 20  # longer than the preparation, shorter than a drain may take
+CAUGHT_UP_MS: Final = 10  # longer than the preparation takes, shorter than a follower is waited for behind it
+STOPPED_MS: Final = 40  # longer than a follower is waited for, shorter than a drain may take
 
 
-def switched(node: str) -> Run:
-    """From LFR to PBR; `node` of the follower is stopped until after the order to drain it."""
+def switched(node: str, stopped_ms: int = STOPPED_MS) -> Run:
+    """From LFR to PBR; `node` of the follower is stopped from the order on."""
     world = World(Setup("lfr", "process", 0, 60, 1000.0))
     world.start()
     world.advance(world.loop.ns + 5 * MS)
     world.adapt(Goal(expression="pbr"))
-    world.inject(Fault(Hang(STOPPED_MS), node, Trigger()))
+    world.inject(Fault(Hang(stopped_ms), node, Trigger()))
     world.end()
     return world.outcome()
 
@@ -30,7 +31,16 @@ def switched(node: str) -> Run:
 def test_a_follower_that_was_stopped_works_off_its_requests_and_is_switched(node: str) -> None:
     run = switched(node)
     assert [a.outcome for a in run.adaptations] == ["done"]
+    assert run.adaptations[0].blackout_ms > CAUGHT_UP_MS, "it is drained while requests wait"
     assert breaches(run) == ()
+
+
+def test_a_follower_that_is_a_little_behind_is_waited_for_while_requests_are_served() -> None:
+    run = switched("b/before", CAUGHT_UP_MS)
+    (adaptation,) = run.adaptations
+    assert adaptation.outcome == "done"
+    assert adaptation.prepare_ms > CAUGHT_UP_MS
+    assert adaptation.blackout_ms < 2
 
 
 def test_an_adaptation_is_under_way_while_it_is_observed_though_it_has_no_task() -> None:

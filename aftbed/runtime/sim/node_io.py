@@ -152,6 +152,10 @@ class SimChannel:
     def nudge(self) -> None:
         """Do nothing: orders arrive without it."""
 
+    def mail_waits(self) -> bool:
+        """Whether a message has arrived."""
+        return bool(self.mail) and self.mail[0][0] <= self._clock.ns
+
     def close(self) -> None:
         self.closed = True
         self._look()
@@ -400,7 +404,7 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
 
     def mail_waits(self) -> bool:
         return any(
-            channel.mail and channel.mail[0][0] <= self._clock.ns
+            channel.mail_waits()
             for hosted in self._fronts
             for channel in map(hosted.inputs.get, hosted.brick.open_ports())
             if channel is not None

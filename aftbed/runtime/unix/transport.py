@@ -16,6 +16,7 @@ import array
 import contextlib
 import mmap
 import os
+import select
 import socket
 import stat
 from collections.abc import Callable, Iterator
@@ -240,6 +241,12 @@ class UnixChannel:
         """Wake the reader, so that it looks for orders. A full queue wakes it just as well."""
         with contextlib.suppress(OSError):
             self.write.send(NUDGE, socket.MSG_DONTWAIT)
+
+    def mail_waits(self) -> bool:
+        """Whether there is a message, or the end of a fenced channel, that the sink has not taken."""
+        poll = select.poll()
+        poll.register(self.read, select.POLLIN)
+        return bool(poll.poll(0))
 
     def close(self) -> None:
         """Close both ends here; nodes keep theirs."""
