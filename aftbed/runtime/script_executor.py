@@ -415,10 +415,9 @@ class Execution:
         A backup of a large state can be milliseconds behind. One that stays behind is waited for no longer.
         """
         drained = [step.brick for step in flat(self.script.commit) if isinstance(step, Drain)]
-        channels = [one for brick in drained for one in self._deployment.channels.into(brick)]
-        loop = self._runtime.loop
+        channels, loop = self._deployment.channels, self._runtime.loop
         for number in range(CATCH_UP_LOOKS):
-            if not any(channel.mail_waits() for channel in channels):
+            if not any(one.mail_waits() for brick in drained for one in channels.into(brick)):
                 return
             looked: Key = ("looked", "backup", number)
             loop.after(CATCH_UP_SECONDS, partial(loop.tasks.settle, looked))
