@@ -3,11 +3,12 @@
 Everything counts, from the start of the workers to the last line in the ledger. `cpu_ms` is the CPU time of
 all processes of an experiment: it distinguishes a slow machine from one that has other work, too.
 
-Each round is a campaign of its own, with its own seed. The limit is what an experiment cannot do without:
+Each round is a campaign of its own, with its own seed. The limit is what an experiment cannot do without, in
+as many processes side by side as the campaign has jobs:
 
 - on real processes, to fork as many processes as the graph has nodes, and the supervisor, and to wait for
-  their end, in as many processes side by side as the campaign has jobs;
-- in the simulator, to have the bare function answer as many requests as an experiment has, in one process.
+  their end;
+- in the simulator, to have the bare function answer as many requests as an experiment has.
 
 Both are in ms for each experiment, as `experiment_ms` is: with two jobs on two cores, it is half of what one
 experiment takes.
@@ -18,6 +19,8 @@ import resource
 import signal
 import time
 from collections import Counter
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final, Literal, NamedTuple
 
 from aftbed.bench.rounds import ROUNDS, InRounds, beside_limit, in_turn, shares
@@ -33,7 +36,8 @@ from aftbed.runtime.unix import interrupts, linux
 from aftbed.runtime.unix.interrupts import scratch_directory
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 
-FORK_SECONDS_MAX: Final = 60.0
+LIMIT_SECONDS_MAX: Final = 60.0
+BARE_TIMES: Final = 10  # that the requests of a simulated experiment are answered: once takes a millisecond
 CRASH: Final = FaultEntry("crash primary", "crash primary at server.exit nth {nth}", draw={"nth": (1, 90)})
 
 
@@ -84,8 +88,9 @@ def bench_campaign(
 
     def limit(number: int) -> float:
         if runtime == "unix":
-            return forks_ms(processes, share[number], jobs)
-        return requests_ms(system.requests, share[number])
+            return limit_ms(partial(fork_and_wait, processes), share[number], jobs)
+        requests = sample_requests(0, system.requests)
+        return limit_ms(partial(answer, requests), BARE_TIMES * share[number], jobs)
 
     found = in_turn(len(share), lambda number: _carried_out(specs[number], jobs), limit, show=show)
     times = [1e3 * one.seconds / len(one.results) for one in found.figures]
@@ -124,53 +129,53 @@ def _carried_out(spec: Spec, jobs: int) -> _Part:
     return _Part(results, seconds, cpu_s)
 
 
-def forks_ms(processes: int, times: int, jobs: int) -> float:
-    """Fork so many processes and wait for them, `times` times, by `jobs` processes: ms for each time.
+def limit_ms(once: Callable[[], None], times: int, jobs: int) -> float:
+    """Do `once` so many times, by `jobs` processes: ms for each time.
 
-    Raises HarnessError if one of the jobs fails.
+    Raises HarnessError if one of them fails.
     """
     parent = os.getpid()
-    share = shares(times, jobs)
     began_s = time.monotonic()
-    workers = [_fork_worker(parent, processes, count) for count in share]
+    workers = [_fork_worker(parent, once, count) for count in shares(times, jobs)]
     statuses = [os.waitpid(worker, 0)[1] for worker in workers]
     seconds = time.monotonic() - began_s
     if any(statuses):
-        raise HarnessError(f"fork and wait: not done within {FORK_SECONDS_MAX:g} s, or no process was left")
+        raise HarnessError(f"the limit: not done within {LIMIT_SECONDS_MAX:g} s, or no process was left")
     return 1e3 * seconds / times
 
 
-def _fork_worker(parent: int, processes: int, times: int) -> int:
+def _fork_worker(parent: int, once: Callable[[], None], times: int) -> int:
     pid = interrupts.fork()
     if pid:
         return pid
     code = 1
     try:
         linux.die_with(parent)
-        signal.setitimer(signal.ITIMER_REAL, FORK_SECONDS_MAX)  # ends the process: the signal has no handler
+        signal.setitimer(signal.ITIMER_REAL, LIMIT_SECONDS_MAX)  # ends the process: the signal has no handler
         for _ in range(times):
-            children = []
-            for _ in range(processes):
-                child = os.fork()
-                if child == 0:
-                    os._exit(0)
-                children.append(child)
-            for child in children:
-                os.waitpid(child, 0)
+            once()
         code = 0
     finally:
         os._exit(code)
 
 
-def requests_ms(requests: int, times: int) -> float:
-    """The bare built-in function answers so many requests, `times` times anew: ms for each time."""
-    sent = sample_requests(0, requests)
-    began_s = time.perf_counter()
-    for _ in range(times):
-        function = default_application()
-        for request in sent:
-            function.execute(request)
-    return 1e3 * (time.perf_counter() - began_s) / times
+def fork_and_wait(processes: int) -> None:
+    """Fork so many processes, which end at once, and wait for them."""
+    children = []
+    for _ in range(processes):
+        child = os.fork()
+        if child == 0:
+            os._exit(0)
+        children.append(child)
+    for child in children:
+        os.waitpid(child, 0)
+
+
+def answer(requests: Sequence[bytes]) -> None:
+    """Have a fresh built-in function answer these."""
+    function = default_application()
+    for request in requests:
+        function.execute(request)
 
 
 def _cpu_s() -> float:

@@ -1,18 +1,21 @@
 """The limits that run in processes of their own: the bare ring with its way to the backup, a death, forks."""
 
 import os
+from collections import Counter
+from functools import partial
 
 import pytest
 from homes import Home
 
 from aftbed.bench.ballast import SIZE_BYTES_MAX
-from aftbed.bench.campaign import forks_ms, requests_ms
+from aftbed.bench.campaign import answer, fork_and_wait, limit_ms
 from aftbed.bench.cycle import RingShape, RingWork, ring_of, ring_us
 from aftbed.bench.recovery import death_ms
 from aftbed.bench.sweep import captured_bytes, state_work
 from aftbed.core.errors import HarnessError
 from aftbed.ftm.compose import EXPRESSIONS, build, hops
 from aftbed.ftm.pages import PAGE_BYTES
+from aftbed.vehicle.aeb.function import sample_requests
 
 # -- its shape
 
@@ -118,5 +121,26 @@ def test_a_ring_whose_process_dies_ends(home: Home) -> None:
 @pytest.mark.process
 def test_the_limits_of_recovery_and_of_a_campaign(home: Home) -> None:
     assert death_ms(pin=True) > 0
-    assert forks_ms(3, 4, 2) > 0
-    assert requests_ms(20, 2) > 0
+    assert limit_ms(partial(fork_and_wait, 3), 4, 2) > 0
+    assert limit_ms(partial(answer, sample_requests(0, 20)), 2, 2) > 0
+
+
+@pytest.mark.process
+def test_a_limit_of_a_campaign_is_shared_by_its_jobs(home: Home) -> None:
+    reader, writer = os.pipe()
+
+    def tell() -> None:
+        os.write(writer, os.getpid().to_bytes(4, "little"))
+
+    limit_ms(tell, 7, 2)
+    os.close(writer)
+    with os.fdopen(reader, "rb") as got:
+        pids = memoryview(got.read()).cast("I").tolist()
+    assert sorted(Counter(pids).values()) == [3, 4]
+    assert os.getpid() not in pids
+
+
+@pytest.mark.process
+def test_a_limit_of_a_campaign_whose_job_fails(home: Home) -> None:
+    with pytest.raises(HarnessError, match="the limit: not done within 60 s, or no process was left"):
+        limit_ms(partial(os._exit, 1), 2, 2)
