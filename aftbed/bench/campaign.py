@@ -37,6 +37,7 @@ from aftbed.runtime.unix.interrupts import scratch_directory
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 
 LIMIT_SECONDS_MAX: Final = 60.0
+LIMIT_TIMES_MAX: Final = 400  # that it is done for a round, so that one of any size keeps to the deadline
 BARE_TIMES: Final = 10  # that the requests of a simulated experiment are answered: once takes a millisecond
 CRASH: Final = FaultEntry("crash primary", "crash primary at server.exit nth {nth}", draw={"nth": (1, 90)})
 
@@ -87,10 +88,10 @@ def bench_campaign(
     processes = len(build(ftm, placement).nodes) + 1
 
     def limit(number: int) -> float:
+        times = min(share[number], LIMIT_TIMES_MAX)
         if runtime == "unix":
-            return limit_ms(partial(fork_and_wait, processes), share[number], jobs)
-        requests = sample_requests(0, system.requests)
-        return limit_ms(partial(answer, requests), BARE_TIMES * share[number], jobs)
+            return limit_ms(partial(fork_and_wait, processes), times, jobs)
+        return limit_ms(partial(answer, sample_requests(0, system.requests)), BARE_TIMES * times, jobs)
 
     found = in_turn(len(share), lambda number: _carried_out(specs[number], jobs), limit, show=show)
     times = [1e3 * one.seconds / len(one.results) for one in found.figures]

@@ -16,7 +16,6 @@ import array
 import contextlib
 import mmap
 import os
-import select
 import socket
 import stat
 from collections.abc import Callable, Iterator
@@ -30,7 +29,7 @@ from aftbed.core.graph import Link
 from aftbed.core.messages import PACKET_BYTES_MAX, UNREADABLE
 from aftbed.inject.shared_state import SHARED_BYTES
 from aftbed.runtime.control import FromNode, ToNode
-from aftbed.runtime.unix.linux import set_timeouts
+from aftbed.runtime.unix.linux import readable, set_timeouts
 
 ANNOUNCED: Final = b"\xc1"  # a byte that MessagePack never uses
 READ_BYTES_MAX: Final = PACKET_BYTES_MAX + 1  # one byte more than is allowed, so that it is noticed
@@ -244,9 +243,7 @@ class UnixChannel:
 
     def mail_waits(self) -> bool:
         """Whether there is a message, or the end of a fenced channel, that the sink has not taken."""
-        poll = select.poll()
-        poll.register(self.read, select.POLLIN)
-        return bool(poll.poll(0))
+        return bool(readable((self.read.fileno(),), 0.0))
 
     def close(self) -> None:
         """Close both ends here; nodes keep theirs."""
