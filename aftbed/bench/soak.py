@@ -10,6 +10,9 @@ The size of the run is sampled after each adaptation, and averaged over a *tour*
 they differ in their size, and a tour has each of them once. The first tour is left out: in it each process
 allocates what it needs for the first time.
 
+The time of a machine that others use drifts by itself. So the time from a crash to the next reply is in
+*deaths*: multiples of `recovery.death_ms`, which is measured right before each crash.
+
 The slope of a figure is the median of the slopes of all pairs of its values (Sen, JASA 63, 1968), with the
 interval that follows from Kendall's tau: it assumes no normal distribution, and an outlier is one value of
 many. A figure is *flat* if its slope is at most a bound with 95 % confidence, so if the upper end of the
@@ -32,6 +35,7 @@ from typing import Final, Literal, NamedTuple
 import msgspec
 
 from aftbed.adapt.engine import DONE
+from aftbed.bench.recovery import DEATH, death_ms
 from aftbed.bench.runs import POLL_SECONDS, Log, Percentiles, percentiles
 from aftbed.campaign.statistics import CONFIDENCE, quantile
 from aftbed.core.errors import ConfigError, HarnessError, unknown
@@ -113,6 +117,7 @@ class SoakResult(msgspec.Struct, frozen=True):
     failovers: int
     adaptations: dict[str, int]
     recovery_ms: Percentiles | None
+    death_ms: Percentiles | None  # the limit of a recovery, measured before each crash
     trends: list[Trend]
     record_mb: float
     judge_seconds: float
@@ -124,6 +129,13 @@ class Sample(NamedTuple):
 
     t_ns: int
     sizes: dict[str, float]
+
+
+class Death(NamedTuple):
+    """How long the machine took to tell of a death, and when (monotonic)."""
+
+    t_ns: int
+    ms: float
 
 
 class Quantity(NamedTuple):
@@ -152,8 +164,9 @@ RSS_BOUND_MB: Final = 1.0  # 2 bytes for each request
 KEPT_BOUND_MB: Final = 3.0  # 4 kB for each crash and adaptation: the supervisor tells of them at the end
 COUNT_BOUND: Final = 10.0  # one for each 50 crashes, or 20 adaptations
 RECORD_BOUND: Final = 50.0  # bytes for each request, of some 1000
-FAILOVER_BOUND_MS: Final = 1.0
-REPLACEMENT_BOUND_MS: Final = 10.0  # of 10: one that read all that was written took a second more
+# In deaths, each of some 1 to 2.5 ms.
+FAILOVER_BOUND: Final = 0.4
+REPLACEMENT_BOUND: Final = 4.0  # one that read all that was written took a second more
 SIZES: Final = (
     Quantity("RSS of supervisor", "MB", KEPT_BOUND_MB),
     *(
@@ -225,6 +238,7 @@ class Soak:
         options, listener = options_for(ftm=first, placement=plan.placement, work=load, record=folder)
         self.launched = launch(options, listener)
         self.samples: list[Sample] = []
+        self.deaths: list[Death] = []
         self.crashes: Counter[str] = Counter()
         self.adaptations: Counter[str] = Counter()
         self._asked = 0  # adaptations
@@ -305,6 +319,7 @@ class Soak:
             rarest = min(chains, key=lambda name: self.crashes[name])
             others = [BACKUP, rarest, *(name for name in nodes if name in GROUPS)]
             target = others[total // 2 % len(others)]
+        self.deaths.append(Death(time.monotonic_ns(), death_ms()))
         fault = Fault(Crash(), target, Trigger())
         self._ask(control_client.InjectCommand(fault))
         self.crashes[target] += 1
@@ -405,6 +420,7 @@ def _result(soak: Soak, history: History, verdict: Verdict, judged_s: float) -> 
         failovers=len(verdict.failovers),
         adaptations=dict(soak.adaptations),
         recovery_ms=percentiles(recovered) if recovered else None,
+        death_ms=percentiles([one.ms for one in soak.deaths]) if soak.deaths else None,
         trends=trends,
         record_mb=round(_bytes_on_disk(soak.launched.record) / 1e6, 1),
         judge_seconds=round(judged_s, 1),
@@ -447,20 +463,31 @@ def _record_trends(soak: Soak, history: History, verdict: Verdict) -> Iterator[T
     if not soak.crashes:
         return
     promoted = history.events(Event.REPLICA_PROMOTED)
-    points = [
-        (float(record.t_ns), one.recovered_ms)
+    failovers = [
+        (record.t_ns, one.recovered_ms)
         for record, one in zip(promoted, verdict.failovers, strict=True)
         if one.recovered_ms is not None and one.fault
     ]
-    yield trend(Quantity("crash to next reply, primary", "ms", FAILOVER_BOUND_MS), points)
+    yield in_deaths("primary", FAILOVER_BOUND, failovers, soak.deaths)
     struck = history.events(Event.FAULT_APPLIED)
     for target in ("client", "proxy"):
-        points = []
+        replacements = []
         for strike, fault in zip(struck, verdict.faults, strict=False):
             place = bisect_left(answered_ns, strike.t_ns)
             if fault.fault == f"crash {target}" and place < len(answered_ns):
-                points.append((float(strike.t_ns), (answered_ns[place] - strike.t_ns) / 1e6))
-        yield trend(Quantity(f"crash to next reply, {target}", "ms", REPLACEMENT_BOUND_MS), points)
+                replacements.append((strike.t_ns, (answered_ns[place] - strike.t_ns) / 1e6))
+        yield in_deaths(target, REPLACEMENT_BOUND, replacements, soak.deaths)
+
+
+def in_deaths(
+    target: str, bound: float, times: Sequence[tuple[int, float]], deaths: Sequence[Death]
+) -> Trend:
+    """Of `times` (ns, ms) from a crash of `target` to the next reply, each by the last death before it."""
+    points = []
+    for t_ns, ms in times:
+        death = deaths[bisect_left(deaths, (t_ns, 0.0)) - 1]
+        points.append((float(t_ns), ms / death.ms))
+    return trend(Quantity(f"crash to next reply, {target}", "x", bound), points)
 
 
 def _mean(values: Sequence[float]) -> float:
@@ -500,9 +527,10 @@ def text(found: SoakResult) -> Iterator[str]:
         f"{sum(found.adaptations.values())} adaptations:"
         f" {', '.join(f'{ftm} {count}' for ftm, count in found.adaptations.items()) or 'none'}"
     )
-    if found.recovery_ms is not None:
-        times = msgspec.structs.asdict(found.recovery_ms)
-        yield f"crash to next reply: {', '.join(f'{name} {ms:g}' for name, ms in times.items())} ms"
+    for what, times_ms in (("crash to next reply", found.recovery_ms), (DEATH, found.death_ms)):
+        if times_ms is not None:
+            times = msgspec.structs.asdict(times_ms)
+            yield f"{what}: {', '.join(f'{name} {ms:g}' for name, ms in times.items())} ms"
     yield (
         f"record of {found.record_mb:g} MB, judged in {found.judge_seconds:g} s"
         f" with {found.judge_rss_mb:g} MB: {found.judged}"

@@ -8,7 +8,8 @@ import pytest
 from homes import Home
 
 from aftbed.bench import soak
-from aftbed.bench.soak import Quantity, SoakPlan, Trend, bench_soak, trend, with_trends
+from aftbed.bench.recovery import DEATH
+from aftbed.bench.soak import Death, Quantity, SoakPlan, Trend, bench_soak, in_deaths, trend, with_trends
 from aftbed.core.errors import ConfigError
 from aftbed.ftm.compose import DUPLEX_EXPRESSIONS
 
@@ -40,6 +41,28 @@ def test_a_figure_is_flat_or_grows_with_confidence_or_it_is_not_known(
 def test_too_few_values_have_no_slope() -> None:
     found = trend(FIGURE, [(number * 1e9, float(number)) for number in range(7)])
     assert (found.slope, found.finding) == (None, "unknown")
+
+
+def crashes(slope: float, drift: float) -> Trend:
+    """Of a run that takes longer by `slope` per 1000 s, on a machine that does by `drift`."""
+    chance = Random(7)
+    times_ns = [2 * 10**9 * number for number in range(400)]
+    deaths = [Death(t_ns, (1 + drift * t_ns / 1e12) * chance.uniform(1.0, 2.0)) for t_ns in times_ns]
+    taken_ms = [
+        (t_ns + 10**6, (2 + slope * t_ns / 1e12) * (1 + drift * t_ns / 1e12) * chance.uniform(1.0, 2.0))
+        for t_ns in times_ns
+    ]
+    return in_deaths("primary", soak.FAILOVER_BOUND, taken_ms, deaths)
+
+
+@pytest.mark.parametrize(
+    ("slope", "drift", "finding"),
+    [(0.0, 0.0, "flat"), (0.0, 2.0, "flat"), (2.0, 0.0, "grows"), (2.0, 2.0, "grows")],
+)
+def test_a_machine_that_becomes_slower_is_not_a_failover_that_does(
+    slope: float, drift: float, finding: str
+) -> None:
+    assert crashes(slope, drift).finding == finding
 
 
 def test_a_figure_that_grows_fails_a_run_that_was_served_right() -> None:
@@ -89,6 +112,8 @@ def test_a_short_run_serves_all_and_does_not_say_that_nothing_grows(home: Home) 
     assert (found.requests.sent, found.requests.lost) == (720, 0)
     assert found.crashes["primary"] >= 1 and sum(found.crashes.values()) >= 2
     assert set(found.adaptations) <= set(DUPLEX_EXPRESSIONS) and found.adaptations
+    assert [one.unit for one in found.trends if one.what.startswith("crash to next reply")] == ["x"] * 3
+    assert found.death_ms is not None and any(DEATH in line for line in soak.text(found))
     assert found.verdict == "inconclusive" and any("too short to tell" in one for one in found.reasons)
     assert "verdict: inconclusive" in list(soak.text(found))
 
