@@ -190,8 +190,9 @@ def test_the_recipe_of_the_paper_is_told_as_such(run: Command) -> None:
 
 
 def test_adaptations_that_were_asked_for_beforehand(home: Home) -> None:
-    adapt = ("--adapt", "switch lfr at request 60", "--adapt", "compose lfr+tr at request 160")
-    ended = aftbed("run", "--load", "300@200", *adapt)
+    """The second one 2 s behind the first: while that is under way it is refused."""
+    adapt = ("--adapt", "switch lfr at request 60", "--adapt", "compose lfr+tr at request 460")
+    ended = aftbed("run", "--load", "600@200", *adapt)
     assert ended.code == 0, ended.out + ended.err
     assert "adapted: 1: pbr to lfr: done" in ended.out
     assert "adapted: 2: lfr to lfr+tr: done" in ended.out
