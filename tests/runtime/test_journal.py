@@ -28,6 +28,7 @@ from aftbed.runtime.unix import journal_files as mapped
 from aftbed.runtime.unix.journal_files import (
     CHUNK_BYTES,
     STATE_EVERY_BYTES,
+    STATE_SHARE_MAX,
     DialogueFile,
     JournalFile,
     JournalHeader,
@@ -131,6 +132,22 @@ def test_a_successor_reads_as_little_after_many_requests_as_after_few(tmp_path: 
     most = STATE_EVERY_BYTES // ENTRY.size
     assert len(last_words(tmp_path, 2)[1]) <= most < 20_000
     assert len(list(entries(dialogue_path(tmp_path, 1).read_bytes()))) == 40_001, "the judge has them all"
+
+
+def test_large_states_take_a_small_share_of_a_dialogue(tmp_path: Path) -> None:
+    """As many requests wait as a Client may have."""
+    dialogue, states = DialogueFile(dialogue_path(tmp_path, 1), "client"), 0
+
+    def capture() -> bytes:
+        nonlocal states
+        states += 1
+        return bytes(2 * STATE_EVERY_BYTES)
+
+    for number in range(10_000):
+        dialogue.keep(number, capture)
+        dialogue.write(number, number, 0, EntryKind.SENT, bytes(50))
+    between = 10_000 * (ENTRY.size + 50)
+    assert 2 <= states <= 1 + STATE_SHARE_MAX * between / (2 * STATE_EVERY_BYTES)
 
 
 def test_a_successor_goes_on_from_predecessors_that_have_kept_no_state(tmp_path: Path) -> None:

@@ -166,12 +166,13 @@ def make_source(client: Client, options: SourceOptions, on_end: Callable[[], Non
     resume_client(client, since, state)
     dialogue = DialogueFile(dialogue_path(journals, options.incarnation), "client")
     if isinstance(work, LoadRun):
-        fixed = is_foreign(options.application)
-        requests = load_requests(options.seed, work.count, fixed=fixed)
         if work.requests:
             given = stored_requests(journals.parent)
             assert given, f"the requests are no longer in {journals.parent}"
             requests = list(given)
+        else:
+            fixed = is_foreign(options.application)
+            requests = load_requests(options.seed, work.count, fixed=fixed)
         if work.turns is not None:
             return LoadInTurns(client, dialogue, requests, work.count, work.rate_hz, work.turns, on_end)
         return Load(client, dialogue, requests, work.count, work.rate_hz, on_end)
