@@ -11,7 +11,8 @@ they differ in their size, and a tour has each of them once. The first tour is l
 allocates what it needs for the first time.
 
 The time of a machine that others use drifts by itself. So the time from a crash to the next reply is in
-*deaths*: multiples of `recovery.death_ms`, which is measured right before each crash.
+*deaths*: multiples of `recovery.death_ms`, which is measured right before each crash. A single death can take
+ten times the median of all, so the unit is the median of those around the crash.
 
 The slope of a figure is the median of the slopes of all pairs of its values (Sen, JASA 63, 1968), with the
 interval that follows from Kendall's tau: it assumes no normal distribution, and an outlier is one value of
@@ -69,6 +70,7 @@ EVERY_SECONDS_MIN: Final = 0.1
 SHOW_SECONDS: Final = 1.0  # between two looks at the time, if nothing happens
 SAMPLE_SECONDS: Final = 5.0  # between samples, where there are no adaptations
 DESCRIPTORS_OF_SPARE: Final = 2  # in the supervisor: its control line and its pidfd
+DEATHS_AROUND: Final = 31  # a crash, by whose median it is told; with a crash every 2 s those of a minute
 VALUES_MIN: Final = 8  # for the interval: of fewer, Kendall's tau is not normally distributed
 
 
@@ -482,11 +484,13 @@ def _record_trends(soak: Soak, history: History, verdict: Verdict) -> Iterator[T
 def in_deaths(
     target: str, bound: float, times: Sequence[tuple[int, float]], deaths: Sequence[Death]
 ) -> Trend:
-    """Of `times` (ns, ms) from a crash of `target` to the next reply, each by the last death before it."""
+    """Of `times` (ns, ms) from a crash of `target` to the next reply, by the median of the deaths around."""
     points = []
     for t_ns, ms in times:
-        death = deaths[bisect_left(deaths, (t_ns, 0.0)) - 1]
-        points.append((float(t_ns), ms / death.ms))
+        last = bisect_left(deaths, (t_ns, 0.0)) - 1
+        first = max(0, min(last - DEATHS_AROUND // 2, len(deaths) - DEATHS_AROUND))
+        around = [death.ms for death in deaths[first : first + DEATHS_AROUND]]
+        points.append((float(t_ns), ms / quantile(around, 0.5)))
     return trend(Quantity(f"crash to next reply, {target}", "x", bound), points)
 
 

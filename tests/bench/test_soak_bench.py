@@ -65,6 +65,13 @@ def test_a_machine_that_becomes_slower_is_not_a_failover_that_does(
     assert crashes(slope, drift).finding == finding
 
 
+def test_a_death_that_takes_ten_times_as_long_is_not_the_unit_of_a_failover() -> None:
+    chance = Random(7)
+    deaths = [Death(2 * 10**9 * number, 2 * chance.lognormvariate(0, 1)) for number in range(900)]
+    taken_ms = [(death.t_ns + 10**6, 12 * chance.uniform(0.7, 1.4)) for death in deaths[8::16]]
+    assert in_deaths("client", soak.REPLACEMENT_BOUND, taken_ms, deaths).finding == "flat"
+
+
 def test_a_figure_that_grows_fails_a_run_that_was_served_right() -> None:
     flat, grows, unknown = (measured(*one) for one in ((0.0, 60), (3.0, 60), (0.0, 10)))
     assert with_trends("pass", [flat]) == ("pass", [])
