@@ -13,7 +13,6 @@ how often that was, and why.
 """
 
 import datetime
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -21,7 +20,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.bench.rounds import Ratio
+from aftbed.bench.rounds import MachineWatch, Meanwhile, Ratio
 from aftbed.bench.runs import Log, run_python, tried
 from aftbed.campaign.ledger import Environment, here
 from aftbed.campaign.statistics import quantile
@@ -211,7 +210,8 @@ class Numbers(msgspec.Struct, frozen=True):
     seconds: float
     environment: Environment
     numbers: tuple[Number, ...]
-    passes: int = 1
+    passes: int
+    machine: Meanwhile
 
 
 def not_measured(found: Numbers) -> list[str]:
@@ -231,7 +231,7 @@ def bench_all(
 
     `log` gets each command. One that fails `TRIES` times in a pass is left out of it.
     """
-    began_s = time.monotonic()
+    watch = MachineWatch()
     run = measure or _measured
     commands = dict.fromkeys(line.command for line in LINES)
     words = {one: f"{one} {QUICK.get(one.split()[0], '')}".strip() if quick else one for one in commands}
@@ -242,14 +242,17 @@ def bench_all(
             show(number * len(words) + len(found), passes * len(words))
             found[one] = _tried(command, run, log)
         by_pass.append([_number(line, found[line.command]) for line in LINES])
+        watch.look()
+        machine = watch.found()
         yield Numbers(
             datetime.datetime.now(datetime.UTC).date().isoformat(),
             code_version(),
             quick,
-            round(time.monotonic() - began_s, 1),
+            machine.seconds,
             here(),
             tuple(map(_over_passes, LINES, zip(*by_pass, strict=True))),
             len(by_pass),
+            machine,
         )
 
 
@@ -398,11 +401,12 @@ def figure_at(document: object, path: str) -> dict[str, float]:
 
 def markdown(found: Numbers) -> Iterator[str]:
     """The table, and the day and the machine above it."""
-    about, several = found.environment, found.passes > 1
+    about, several, steal = found.environment, found.passes > 1, found.machine.steal_percent
     options = f"{' --quick' if found.quick else ''}{f' --passes {found.passes}' if several else ''}"
     yield (
         f"Measured on {found.date} by `aftbed bench all{options}` in {found.seconds:.0f} s: {about.cpus};"
-        f" {about.kernel.partition('-')[0]}; {about.python}; aftbed {found.code}."
+        f" {about.kernel.partition('-')[0]}; {about.python}; aftbed {found.code};"
+        f" {f'{steal:g} %' if steal is not None else 'unknown'} steal meanwhile."
         + (f" Each value is the median of {found.passes} passes, with its quartiles." if several else "")
     )
     yield ""

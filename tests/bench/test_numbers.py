@@ -217,6 +217,16 @@ def test_a_row_of_the_table() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("percent", "words"), [(2.6, "2.6 % steal"), (0.0, "0 % steal"), (None, "unknown steal")]
+)
+def test_the_table_says_what_was_stolen_meanwhile(percent: float | None, words: str) -> None:
+    found = measured()
+    machine = msgspec.structs.replace(found.machine, steal_percent=percent)
+    first = next(markdown(msgspec.structs.replace(found, machine=machine)))
+    assert first.endswith(f"; {words} meanwhile.")
+
+
 def test_every_row_has_as_many_cells_as_the_head() -> None:
     rows = [row for row in markdown(measured()) if row.startswith("|")]
     assert len(rows) == len(LINES) + 2 and {row.count("|") for row in rows} == {7}
