@@ -36,7 +36,8 @@ passes on; and `checkpoint.sent` to `reply.stored`, one hop, but with a second m
 That message wakes a process on the other core: it costs about as much as a hop if that core sleeps, and
 little if it is busy. Pairs of this kind are reported apart, as `beside`. Under another mechanism the pairs
 follow by the same rules from the path of its requests; a brick that notes the same event in two visits
-(TR's executions) is left out.
+(TR's executions) is left out. The limit is a turn of the bare ring, which takes turns with the run, divided
+by its hops.
 
 Limits: other work on the machine is in the upper quantiles. The journal's writes are part of a hop.
 """
@@ -59,8 +60,6 @@ import msgspec
 from aftbed.bench.rounds import (
     ROUNDS,
     InRounds,
-    MachineWatch,
-    Meanwhile,
     Rounds,
     as_node,
     become_node,
@@ -152,12 +151,9 @@ class CycleRun(NamedTuple):
         The latter are none where it was not let run at all. Raises HarnessError.
         """
         with other(THEIRS) as measured:
-            record = self._record(WARM_UP + count + count // 2 + SENT_MORE, OURS)
-        cycles = answered(record)
-        began_ns, ended_ns = cycles[0].began_ns, cycles[-1].began_ns
-        beside = settled((one for one in measured if began_ns <= one.began_ns <= ended_ns), THEIRS, 1)
-        ours = settled(cycles[WARM_UP:], OURS, count)[:count]
-        return [one.us for one in ours], [one.us for one in beside]
+            record = self._record(sent_for(count), OURS)
+        ours = settled(answered(record, skip=WARM_UP), OURS, count)[:count]
+        return [one.us for one in ours], _beside_us(measured, record)
 
     @contextlib.contextmanager
     def in_turns(self, turns: Turns, skip: int = WARM_UP) -> Iterator[list[TimedSample]]:
@@ -179,6 +175,19 @@ class CycleRun(NamedTuple):
             given=self.given,
             turns=turns,
         )
+
+
+def sent_for(count: int) -> int:
+    """How many requests are sent in turns, so that `settled` leaves `count` behind the warm-up."""
+    return WARM_UP + count + count // 2 + SENT_MORE
+
+
+def _beside_us(measured: Iterable[TimedSample], record: RunRecord) -> list[float]:
+    """What was measured in the other turns, between the first and the last request of `record`."""
+    sent = answered(record)
+    began_ns, ended_ns = sent[0].began_ns, sent[-1].began_ns
+    within = (one for one in measured if began_ns <= one.began_ns <= ended_ns)
+    return [one.us for one in settled(within, THEIRS, 1)]
 
 
 def side_by_side(sides: Sequence[Side], turn_ns: int, seconds: float) -> list[list[float]]:
@@ -548,11 +557,11 @@ class PairDelay(msgspec.Struct, frozen=True):
     p50_ns: int
 
 
-class HopDelays(msgspec.Struct, frozen=True):
+class HopDelays(InRounds, frozen=True):
     """The delay of one hop, over all `pairs` and requests, by nearest rank; `beside` is not in it.
 
     `hop_ns`: a few quantiles by name; `percentiles_ns`: (percent, ns) for 0, 1, ..., 99, 99.9, 100;
-    `quantiles_ns`: the 129 quantiles 0/128, 1/128, ..., 128/128.
+    `quantiles_ns`: the 129 quantiles 0/128, 1/128, ..., 128/128. The limit is in ns, too.
     """
 
     ftm: str
@@ -563,26 +572,44 @@ class HopDelays(msgspec.Struct, frozen=True):
     quantiles_ns: tuple[int, ...]
     pairs: tuple[PairDelay, ...]
     beside: tuple[PairDelay, ...]
-    machine: Meanwhile
 
 
-def bench_hops(ftm: str, count: int, *, pin: bool = True) -> HopDelays:
-    """Run `count` requests under `ftm` in a closed loop, after a warm-up, and read the hops off its record.
+def bench_hops(
+    ftm: str, count: int, *, pin: bool = True, rounds: int = CYCLE_ROUNDS, show: Show = unshown
+) -> HopDelays:
+    """Read the hops of `count` requests off the records of runs in a closed loop, in turn with the ring.
 
-    Raises HarnessError where the run ended early, or no run of RUNS_MAX went without an alarm.
+    Raises HarnessError where a run ended early, or no run of RUNS_MAX went without an alarm.
     """
-    pairs, beside = single_hops(build(ftm, PLACEMENT))
-    watch = MachineWatch()
-    record = undisturbed(ftm, count + WARM_UP, pin=pin)
-    machine = watch.found()
-    delays = {pair: delays_ns(record, pair, WARM_UP) for pair in (*pairs, *beside)}
-    for (source, sink), found in delays.items():
-        if len(found) != count:
-            raise HarnessError(f"{len(found)} of {count} requests have both notes: {source}, {sink}")
-    ordered = sorted(itertools.chain.from_iterable(delays[pair] for pair in pairs))
+    graph = build(ftm, PLACEMENT)
+    shape, (pairs, beside) = ring_of(graph), single_hops(graph)
+    sent = sample_requests(0, 64)
+    ring = partial(ring_in_turns, shape, sum(map(len, sent)) // len(sent), pin=pin)
+    share = shares(count, rounds)
+
+    def both(number: int) -> tuple[dict[NotePair, list[int]], list[float]]:
+        with ring(THEIRS) as measured:
+            record = undisturbed(ftm, sent_for(share[number]), pin=pin, turns=OURS)
+        hops = {
+            pair: settled(delays(record, pair, WARM_UP), OURS, share[number])[: share[number]]
+            for pair in (*pairs, *beside)
+        }
+        for (source, sink), of_pair in hops.items():
+            if len(of_pair) != share[number]:
+                raise HarnessError(
+                    f"{len(of_pair)} of {share[number]} requests have both notes: {source}, {sink}"
+                )
+        in_ns = {pair: [round(one.us * 1e3) for one in of_pair] for pair, of_pair in hops.items()}
+        return in_ns, [us * 1e3 / shape.hops for us in _beside_us(measured, record)]
+
+    found = together(len(share), both, show)
+    figures = [[ns for pair in pairs for ns in of_round[pair]] for of_round in found.figures]
+    ordered = sorted(itertools.chain.from_iterable(figures))
+    in_rounds = beside_limit(f"hop of the {shape.name}", figures, found.limits, 0)
 
     def delay(pair: NotePair) -> PairDelay:
-        return PairDelay(str(pair[0]), str(pair[1]), quantile(delays[pair], 0.5))
+        of_pair = [ns for of_round in found.figures for ns in of_round[pair]]
+        return PairDelay(str(pair[0]), str(pair[1]), quantile(of_pair, 0.5))
 
     return HopDelays(
         ftm=ftm,
@@ -593,18 +620,20 @@ def bench_hops(ftm: str, count: int, *, pin: bool = True) -> HopDelays:
         quantiles_ns=tuple(quantile(ordered, step / STEPS) for step in range(STEPS + 1)),
         pairs=tuple(map(delay, pairs)),
         beside=tuple(map(delay, beside)),
-        machine=machine,
+        limit=in_rounds.limit,
+        ratio=in_rounds.ratio,
+        machine=found.machine,
     )
 
 
-def undisturbed(ftm: str, count: int, *, pin: bool = True) -> RunRecord:
+def undisturbed(ftm: str, count: int, *, pin: bool = True, turns: Turns | None = None) -> RunRecord:
     """The record of a run in which the replica that led first led to its end, and kept its backup.
 
     On a machine that is busy with other things a Watchdog may take a chain for a hung one. Raises
     HarnessError where that happened in RUNS_MAX runs.
     """
     for _ in range(RUNS_MAX):
-        record = limited_run(ftm, PLACEMENT, count, pin=pin)
+        record = limited_run(ftm, PLACEMENT, count, pin=pin, turns=turns)
         if not record.history.events(Event.WATCHDOG_SUSPECT):
             return record
     raise HarnessError(f"an alarm in each of {RUNS_MAX} runs: the machine is too busy for this measurement")
@@ -645,10 +674,14 @@ def _visits(graph: Graph) -> list[NotePlace | None]:
     return found
 
 
-def delays_ns(record: RunRecord, pair: NotePair, skip: int) -> list[int]:
-    """The time between the notes of `pair` (ns), of each request behind the first `skip` that has both."""
+def delays(record: RunRecord, pair: NotePair, skip: int) -> list[TimedSample]:
+    """From the first note of `pair` to the second, of each request behind the first `skip` that has both."""
     source, sink = (
         {r.request_id: r.t_ns for r in record.history.events(place.event) if r.node == place.brick}
         for place in pair
     )
-    return [t_ns - source[i] for i, t_ns in sink.items() if i in source and i > skip]
+    return [
+        TimedSample(source[i], (t_ns - source[i]) / 1e3)
+        for i, t_ns in sink.items()
+        if i in source and i > skip
+    ]

@@ -33,7 +33,7 @@ COMMAND_SECONDS_MAX: Final = 1200.0
 BEGIN, END = "<!-- numbers: begin -->", "<!-- numbers: end -->"  # of the table in a page
 QUICK: Final = {  # what makes a command short; too few samples to quote
     "cycle": "--count 200 --rounds 2",
-    "hops": "--count 200",
+    "hops": "--count 200 --rounds 2",
     "recovery": "--kills 2",
     "adapt": "--adaptations 2",
     "launch": "--runs 1",
@@ -117,7 +117,7 @@ LINES: Final = (
     _cycle("cycle under `lfr`", "lfr --beside pbr", p50=0.9),
     _cycle("cycle under `pbr+tr`", "pbr+tr --beside pbr", p50=1.8),
     _cycle("cycle under `lfr+tr`", "lfr+tr --beside lfr", p50=1.8),
-    TableLine("delay of one hop under `pbr`", "hops --ftm pbr", "hop_ns", "ns"),
+    TableLine("delay of one hop under `pbr`", "hops --ftm pbr", "hop_ns", "ns", OWN, OWN_RATIO),
     _recovery("SIGKILL of the primary to the next good reply, `pbr`", "--ftm pbr"),
     TableLine("its parts, p50", "recovery --ftm pbr", "parts_ms.*.p50", "ms"),
     _recovery("the same, a process per replica", "--ftm pbr --placement replica"),

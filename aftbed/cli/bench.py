@@ -30,7 +30,6 @@ from aftbed.functions.source import located
 from aftbed.report.progress import ProgressLine
 
 bench = typer.Typer(cls=PlainGroup)
-REQUESTS_MIN: Final = 5000
 SENT_FUNCTION: Final = 512  # requests of MODULE:FUNCTION, sent in turn
 KILLS_MIN: Final = 1
 
@@ -239,13 +238,14 @@ def state(
 @bench.command()
 def hops(
     ftm: Ftm = "pbr",
-    count: Count = REQUESTS_MIN,
+    count: Count = CYCLES,
     pin: Pin = True,
+    rounds: Rounds = CYCLE_ROUNDS,
     json: Json = False,
 ) -> None:
-    """The delay of one hop between two bricks in processes of their own, as a distribution."""
-    with _measuring("hops", as_json=json):
-        found = bench_hops(ftm, count, pin=pin)
+    """The delay of one hop between two bricks in processes of their own, beside one of the bare ring."""
+    with _measuring("hops", as_json=json) as progress:
+        found = bench_hops(ftm, count, pin=pin, rounds=rounds, show=progress.show)
     if json:
         _print(found, as_json=True)
         return
@@ -255,7 +255,7 @@ def hops(
     for pair in (*found.pairs, *found.beside):
         apart = "  (not used: sends more)" if pair in found.beside else ""
         print(f"p50 {pair.p50_ns / 1e3:9.2f} us  {pair.source} -> {pair.sink}{apart}")
-    print("\n".join(text({"machine": found.machine})))
+    print("\n".join(text({"limit": found.limit, "ratio": found.ratio, "machine": found.machine})))
 
 
 @bench.command()

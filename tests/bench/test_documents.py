@@ -48,6 +48,11 @@ def test_a_cycle(home: Home) -> None:
     assert set(found["cycle_us"]) == set(found["ring_us"]) == QUANTILES
 
 
+def test_a_hop(home: Home) -> None:
+    found = document("hops", "--count", "101", "--rounds", "2")
+    check_beside(found, "hop of the bare ring of 12 hops and 1 to the backup", 2)
+
+
 @pytest.mark.parametrize(
     ("words", "ftm", "placement"),
     [(("--beside", "none"), "none", "replica"), (("--beside-placement", "single"), "pbr", "single")],

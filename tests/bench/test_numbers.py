@@ -37,7 +37,7 @@ RATIO: Final = {
 BESIDE: Final = {"limit": {**TIMES, "p50": 1.0, "name": "the limit"}, "ratio": RATIO}
 DOCUMENTS: Final[dict[str, Document]] = {  # by the first word of a command
     "cycle": {"cycle_us": TIMES, **BESIDE},
-    "hops": {"hop_ns": {"p1": 5, "p50": 9}},
+    "hops": {"hop_ns": {"p1": 5, "p50": 9}, **BESIDE},
     "recovery": {
         "recovery_ms": TIMES,
         **BESIDE,
