@@ -28,7 +28,7 @@ FAULT := crash primary at checkpoint.sent nth 100
 # Hundreds of interpreters start in the tests; without bytecode each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test lint fast simulation process pages deep mutants bench soak docs pictures
+.PHONY: help demo test lint fast simulation process pages noisy deep mutants bench soak docs pictures
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
 
@@ -40,6 +40,7 @@ help:
 	@echo "make simulation  the tests that simulate many runs or drives: whole commands, searches, planted bugs"
 	@echo "make process     the tests that start real runs: a sample of their combinations"
 	@echo "make pages       every command of README.md and docs/, run as it stands there: a CI's, after make test"
+	@echo "make noisy       all of these beside bursts of other work on every core, as root: which test needs a quiet machine?"
 	@echo "make deep        the exhaustive tests, and thousands of examples of every property: hours"
 	@echo "make docs        the pages of docs/ as a site: build/docs/index.html"
 	@echo "make pictures    the pictures of the README, of runs that it makes (ONLY=page: that one; with Chromium and tmux)"
@@ -69,6 +70,9 @@ process: $(EDITABLE)
 
 pages: $(EDITABLE)
 	$(BIN)/python -m pytest $(TWO_AT_A_TIME) $(PAGES)
+
+noisy: $(EDITABLE)
+	$(BIN)/python tests/noise.py $(MAKE) --keep-going fast simulation process pages
 
 deep: $(EDITABLE)
 	$(BIN)/python -m pytest -m deep
