@@ -44,7 +44,7 @@ def forked(work: Callable[[], NoReturn]) -> None:
 
 
 if __name__ == "__main__":
-    try:  # refused here and not in the children, which nobody watches
+    try:  # refused here and not in the children, whose errors are not seen
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     except PermissionError:
