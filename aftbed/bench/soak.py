@@ -50,7 +50,7 @@ from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault
 from aftbed.inject.targets import BACKUP, PRIMARY
-from aftbed.judge.checks import Requests
+from aftbed.judge.checks import Requests, number_of
 from aftbed.judge.record import read_record
 from aftbed.judge.verdict import Verdict, Word, judge
 from aftbed.runtime.unix import control_client
@@ -471,12 +471,12 @@ def _record_trends(soak: Soak, history: History, verdict: Verdict) -> Iterator[T
         if one.recovered_ms is not None and one.fault
     ]
     yield in_deaths("primary", FAILOVER_BOUND, failovers, soak.deaths)
-    struck = history.events(Event.FAULT_APPLIED)
+    faults = {report.number: report.fault for report in verdict.faults}
     for target in ("client", "proxy"):
         replacements = []
-        for strike, fault in zip(struck, verdict.faults, strict=False):
+        for strike in history.events(Event.FAULT_APPLIED):
             place = bisect_left(answered_ns, strike.t_ns)
-            if fault.fault == f"crash {target}" and place < len(answered_ns):
+            if faults.get(number_of(strike)) == f"crash {target}" and place < len(answered_ns):
                 replacements.append((strike.t_ns, (answered_ns[place] - strike.t_ns) / 1e6))
         yield in_deaths(target, REPLACEMENT_BOUND, replacements, soak.deaths)
 
