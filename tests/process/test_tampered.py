@@ -211,6 +211,11 @@ def other_states(found: dict[str, Any]) -> None:
     found["states"]["b"] = "0" * 16
 
 
+def ended_before_its_last_record(record: Path) -> None:
+    last_ns = max(read_record(record).history.times())
+    set_to("end.json", ended_ns=last_ns - 1)(record)
+
+
 def without_brick(found: dict[str, Any]) -> None:
     found["hosted"]["bricks"].pop()
 
@@ -269,7 +274,7 @@ TAMPERS: Final[dict[str, Tamper]] = {
     "another mechanism": set_to("run.json", ftm="lfr+tr"),
     "a later start": edited("run.json", lambda f: f.update(started_ns=f["started_ns"] + NS_PER_S)),
     "no end": lambda record: (record / "end.json").unlink(),
-    "an earlier end": edited("end.json", lambda f: f.update(ended_ns=f["ended_ns"] - NS_PER_S // 2)),
+    "an end before the last record": ended_before_its_last_record,
     "an end without what was left": without("end.json", "left"),
     "an end with what was left": set_to("end.json", left=["a/server (77)"]),
     "an end without states": without("end.json", "states"),
