@@ -48,7 +48,7 @@ from aftbed.core.progress import Show, unshown
 from aftbed.ftm.compose import DUPLEX_EXPRESSIONS
 from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Trigger
-from aftbed.inject.model import Fault
+from aftbed.inject.model import Fault, FaultReport
 from aftbed.inject.targets import BACKUP, PRIMARY
 from aftbed.judge.checks import Requests, number_of
 from aftbed.judge.record import read_record
@@ -322,6 +322,7 @@ class Soak:
             others = [BACKUP, rarest, *(name for name in nodes if name in GROUPS)]
             target = others[total // 2 % len(others)]
         self.deaths.append(Death(time.monotonic_ns(), death_ms()))
+        self._settle()  # where the machine stood still meanwhile, a replica may have been lost
         fault = Fault(Crash(), target, Trigger())
         self._ask(control_client.InjectCommand(fault))
         self.crashes[target] += 1
@@ -454,7 +455,6 @@ def _size_trends(soak: Soak) -> Iterator[Trend]:
 def _record_trends(soak: Soak, history: History, verdict: Verdict) -> Iterator[Trend]:
     """Bytes of the record per request, and the times of failovers and of other things that interrupt."""
     sent_ns = [e.t_ns for e in history.dialogue if e.kind is EntryKind.SENT]
-    answered_ns = [e.t_ns for e in history.dialogue if e.kind is EntryKind.ANSWERED]
     ends = soak.samples[soak.tour - 1 :: soak.tour]
     points = []
     for before, after in pairwise(ends):
@@ -471,14 +471,17 @@ def _record_trends(soak: Soak, history: History, verdict: Verdict) -> Iterator[T
         if one.recovered_ms is not None and one.fault
     ]
     yield in_deaths("primary", FAILOVER_BOUND, failovers, soak.deaths)
-    faults = {report.number: report.fault for report in verdict.faults}
     for target in ("client", "proxy"):
-        replacements = []
-        for strike in history.events(Event.FAULT_APPLIED):
-            place = bisect_left(answered_ns, strike.t_ns)
-            if faults.get(number_of(strike)) == f"crash {target}" and place < len(answered_ns):
-                replacements.append((strike.t_ns, (answered_ns[place] - strike.t_ns) / 1e6))
-        yield in_deaths(target, REPLACEMENT_BOUND, replacements, soak.deaths)
+        yield in_deaths(target, REPLACEMENT_BOUND, replacements(history, verdict.faults, target), soak.deaths)
+
+
+def replacements(history: History, faults: Sequence[FaultReport], target: str) -> list[tuple[int, float]]:
+    """When each crash of `target` struck (ns), and how long after it the next reply came (ms)."""
+    answered_ns = [e.t_ns for e in history.dialogue if e.kind is EntryKind.ANSWERED]
+    crashes = {report.number for report in faults if report.fault == f"crash {target}"}
+    struck_ns = [s.t_ns for s in history.events(Event.FAULT_APPLIED) if number_of(s) in crashes]
+    places = [(t_ns, bisect_left(answered_ns, t_ns)) for t_ns in struck_ns]
+    return [(t_ns, (answered_ns[at] - t_ns) / 1e6) for t_ns, at in places if at < len(answered_ns)]
 
 
 def in_deaths(

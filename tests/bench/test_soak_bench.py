@@ -6,12 +6,16 @@ from typing import Final
 
 import pytest
 from homes import Home
+from tales import Tale
 
 from aftbed.bench import soak
 from aftbed.bench.recovery import DEATH
 from aftbed.bench.soak import Death, Quantity, SoakPlan, Trend, bench_soak, in_deaths, trend, with_trends
 from aftbed.core.errors import ConfigError
+from aftbed.core.events import FIRST_FAULT, Event
 from aftbed.ftm.compose import DUPLEX_EXPRESSIONS
+from aftbed.inject.model import FaultReport
+from aftbed.inject.receipts import ReceiptState, record_detail
 
 FIGURE: Final = Quantity("a figure", "MB", 1.0)
 PLAN: Final = SoakPlan(30.0, 500.0, 2.0, 5.0, "process")
@@ -70,6 +74,22 @@ def test_a_death_that_takes_ten_times_as_long_is_not_the_unit_of_a_failover() ->
     deaths = [Death(2 * 10**9 * number, 2 * chance.lognormvariate(0, 1)) for number in range(900)]
     taken_ms = [(death.t_ns + 10**6, 12 * chance.uniform(0.7, 1.4)) for death in deaths[8::16]]
     assert in_deaths("client", soak.REPLACEMENT_BOUND, taken_ms, deaths).finding == "flat"
+
+
+def test_a_fault_that_does_not_strike_leaves_the_strikes_of_others_theirs() -> None:
+    reports = [
+        FaultReport("crash client", ReceiptState.APPLIED),
+        FaultReport("crash proxy", ReceiptState.NOT_ACTIVATED, number=1),
+        FaultReport("crash proxy", ReceiptState.APPLIED, number=2),
+        FaultReport("crash client", ReceiptState.APPLIED, number=3),
+    ]
+    tale = Tale()
+    for number, ms in ((0, 10), (2, 6), (3, 20)):
+        strike = record_detail(FIRST_FAULT + number)
+        tale.note("supervisor.1", Event.FAULT_APPLIED, detail=strike).wait(ms - 5).served(number + 1)
+    history = tale.history()
+    assert [ms for _, ms in soak.replacements(history, reports, "client")] == [10, 20]
+    assert [ms for _, ms in soak.replacements(history, reports, "proxy")] == [6]
 
 
 def test_a_figure_that_grows_fails_a_run_that_was_served_right() -> None:
