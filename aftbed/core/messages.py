@@ -361,6 +361,15 @@ class Release(Message, frozen=True, tag=46):
     request_id: int
 
 
+class Redundancy(Message, frozen=True, tag=47):
+    """Runtime to a brick of the leader (`BrickKind.told_redundancy`), in `epoch`: is this replica `alone`,
+    although its mechanism has a backup?
+    """
+
+    epoch: int
+    alone: bool
+
+
 WireMessage = (  # between bricks
     Request
     | Reply
@@ -394,6 +403,7 @@ AnyMessage = (  # all that a brick may receive
     | TakeUp
     | HoldAt
     | Release
+    | Redundancy
 )
 
 

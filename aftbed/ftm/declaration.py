@@ -56,6 +56,7 @@ class BrickKind(Kind, frozen=True, kw_only=True):
     `sends_beside`: it sends more than one message in the step of its note.
     `backup_executes`: with this brick, the Server of the backup executes every request too.
     `checks_replies`: it asks the protected function whether a reply can be right.
+    `told_redundancy`: the one of the leader is told whether there is a backup (`Redundancy`).
     """
 
     make: Callable[[Setting], Brick]
@@ -65,6 +66,7 @@ class BrickKind(Kind, frozen=True, kw_only=True):
     sends_beside: bool = False
     backup_executes: bool = False
     checks_replies: bool = False
+    told_redundancy: bool = False
 
 
 class Suitability(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -14,9 +14,10 @@ A Watchdog sees none of this: a brick that waits for a lost message is alive, an
 violation ends the node, as a failed assertion does: a detected stop. Under a duplex the Watchdog then sees a
 death, and Recovery fences the replica. No reply leaves that is out of order or late.
 
-The deadline is `LENIENT_NS` in a follower, whose reply nothing waits for, and in a replica that has taken
-over no longer ago than that: until it has a backup, a late reply is better than none. So a machine that
-stands still does not end both.
+Only a leader that another replica can replace is held to that. Nothing waits for the reply of a follower,
+and a late reply of a leader whose backup is lost is better than none. Their deadline is `LENIENT_NS`, and it
+counts only while the host of After runs on time. So a machine that stands still, however long, does not end
+both.
 
 Limits: what happens outside of Before and After, as the checkpoint of an outer PBR, is not seen; a request
 that comes from there twice is. A second execution is noticed by its reply, with the next request: the state
@@ -28,6 +29,7 @@ from enum import auto
 from typing import ClassVar, Final
 
 from aftbed.core.brick import (
+    ANY_STATE,
     CONTROL,
     DEADLINE_PASSED,
     NO_REQUEST,
@@ -45,13 +47,13 @@ from aftbed.core.brick import (
     hand_on,
 )
 from aftbed.core.events import LATE, Event
-from aftbed.core.messages import AnyMessage, Reply, Request, TakeOver
+from aftbed.core.messages import AnyMessage, Redundancy, Reply, Request, TakeOver
 from aftbed.ftm.chain import COMPUTE, PassState
 from aftbed.ftm.declaration import BrickKind, Emits, Mechanism, Suitability
+from aftbed.ftm.failover import LATE_NS_MAX
 
 DEADLINE_NS: Final = 25_000_000  # a cycle of the radar and a quarter; half of the HANG_DEADLINE_NS
-LENIENT_NS: Final = 500_000_000  # as long as a new backup may take to be made
-NEVER_NS: Final = 1 << 63
+LENIENT_NS: Final = 500_000_000
 
 _EXIT: Final = Event.BEFORE_EXIT  # bound once: a look-up in an enumeration is slow on the hot path
 
@@ -108,7 +110,10 @@ _IN_ORDER: Final = ReplyComes.IN_ORDER
 
 
 class SupAfter(Machine):
-    """The supervision. `announced`: the request inside; `held`: the reply that came ahead."""
+    """The supervision. `announced`: the request inside; `held`: the reply that came ahead.
+
+    A new epoch shows that this replica has taken over, and that it is alone.
+    """
 
     AT_REST = (_S.IDLE,)
 
@@ -116,36 +121,40 @@ class SupAfter(Machine):
         super().__init__()
         self.epoch, self.announced = epoch, NO_REQUEST
         self.held: Reply | None = None
-        self._now_ns, self._lenient_until_ns = 0, 0 if leads else NEVER_NS
-        self._allowed_ns = DEADLINE_NS
-        self._until_ns: int | None = None
+        self._strict = leads
+        self._now_ns = 0
+        self._began_ns: int | None = None  # what is inside, for the deadline
 
     def step(self, port: str, msg: AnyMessage | DeadlinePassed, now_ns: int) -> list[Effect]:
         """As every Machine; its handlers know the time."""
         self._now_ns = now_ns
         return super().step(port, msg, now_ns)
 
+    def learn_redundancy(self, msg: Redundancy) -> list[Effect]:
+        self.epoch, self._strict = max(self.epoch, msg.epoch), not msg.alone
+        return []
+
     def expect(self, msg: Request) -> list[Effect]:
-        """Its deadline runs from here on. A new epoch shows that this replica has taken over."""
-        self.announced = msg.request_id
+        """Its deadline runs from here on."""
+        self.announced, self._began_ns = msg.request_id, self._now_ns
         if msg.epoch > self.epoch:
-            self.epoch, self._lenient_until_ns = msg.epoch, self._now_ns + LENIENT_NS
-        self._allowed_ns = LENIENT_NS if self._now_ns < self._lenient_until_ns else DEADLINE_NS
-        self._until_ns = self._now_ns + self._allowed_ns
+            self.epoch, self._strict = msg.epoch, False
         return []
 
     def how(self, msg: Reply) -> ReplyComes:
         if msg.request_id != self.announced:
             return ReplyComes.OUT_OF_ORDER
-        return ReplyComes.LATE if self._until_ns is not None and self._now_ns >= self._until_ns else _IN_ORDER
+        due_ns = self.deadline_ns()
+        late = self._strict and due_ns is not None and self._now_ns >= due_ns
+        return ReplyComes.LATE if late else _IN_ORDER
 
     def release(self, msg: Reply) -> list[Effect]:
-        self._until_ns = None
+        self._began_ns = None
         return [Send("aft2pro", msg)]
 
     def hold(self, msg: Reply) -> list[Effect]:
         """Two channels: the announcement was sent first. Before a reply that comes twice, none was."""
-        self.held, self._until_ns = msg, self._now_ns + DEADLINE_NS
+        self.held, self._began_ns = msg, self._now_ns
         return []
 
     def is_of_held(self, msg: Request) -> bool:
@@ -158,8 +167,8 @@ class SupAfter(Machine):
         return self.release(held)
 
     def stop_at_held(self, msg: Request | DeadlinePassed) -> list[Effect]:
-        self._until_ns = None
         assert self.held is not None
+        self._began_ns = None
         number = self.held.request_id
         return stop(number, f"a reply to request {number}, which was not announced")
 
@@ -168,17 +177,27 @@ class SupAfter(Machine):
 
     def stop_late(self, msg: Reply | DeadlinePassed) -> list[Effect]:
         """No reply, or too late."""
-        self._until_ns = None
+        self._began_ns = None
         reason = f"request {self.announced} took more than {self._allowed_ns / 1e6:g} ms"
         return stop(self.announced, reason, LATE)
 
+    @property
+    def _allowed_ns(self) -> int:
+        return DEADLINE_NS if self._strict else LENIENT_NS
+
     def deadline_ns(self) -> int | None:
-        return self._until_ns
+        return None if self._began_ns is None else self._began_ns + self._allowed_ns
 
     def wake(self, now_ns: int) -> list[Effect]:
+        due_ns = self.deadline_ns()
+        assert due_ns is not None
+        if not self._strict and now_ns - due_ns > LATE_NS_MAX:  # the machine stood still
+            self._began_ns = now_ns
+            return []
         return self.step(CONTROL, DEADLINE_PASSED, now_ns)
 
     MOVES: ClassVar[Moves] = {
+        (ANY_STATE, CONTROL, Redundancy): (learn_redundancy, SAME_STATE),
         (_S.IDLE, "bfr2aft", Request): (expect, _S.INSIDE),
         (_S.IDLE, "prd2aft", Reply): (hold, _S.AHEAD),
         (_S.IDLE, "prd2aft", TakeOver): (hand_on("aft2pro"), SAME_STATE),
@@ -216,6 +235,7 @@ SUP: Final = Mechanism(
         ("aft2pro",),
         # It emits `detected.stop` too; a fault is aimed at that of TR's After, since one kind stands for it.
         make=lambda setting: SupAfter(setting.epoch, setting.leads),
+        told_redundancy=True,
     ),
     links=(("before", "bfr2aft", "after"),),
     suitability=Suitability(detects=("flow",), cpus=1, cpu_load="low", bandwidth="none"),

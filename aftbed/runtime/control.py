@@ -17,6 +17,7 @@ from aftbed.core.messages import (
     Promoted,
     Promotion,
     Rebound,
+    Redundancy,
     Release,
     RequestHeld,
     Situation,
@@ -32,7 +33,7 @@ from aftbed.vehicle.condition import Condition
 WHOLE: Final = 1.0  # of a CPU
 UNANSWERED: Final = 0  # the token of an order that gets no Ack
 
-ToBrick = Promotion | Rebound | Watch | Situation | Adapt | Progress | TakeUp | HoldAt | Release
+ToBrick = Promotion | Rebound | Watch | Situation | Redundancy | Adapt | Progress | TakeUp | HoldAt | Release
 FromBrick = Promoted | Adapted | RequestHeld  # from a brick to the executive
 NOWHERE: Final = -1  # the index of a port that is to lead nowhere
 

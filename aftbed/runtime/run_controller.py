@@ -6,6 +6,7 @@ it dies. The controller is not on the request path: while it sleeps, requests fl
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import Final
 
@@ -15,7 +16,10 @@ from aftbed.core import messages, script
 from aftbed.core.errors import StepFailed
 from aftbed.core.events import Event
 from aftbed.core.graph import Graph
+from aftbed.core.messages import Redundancy
 from aftbed.core.script import LOSSES, Phase, ScriptKind
+from aftbed.ftm.compose import replication_of
+from aftbed.ftm.registry import BRICKS
 from aftbed.runtime import control
 from aftbed.runtime.adaptations import CLIENT, ENGINE, REPLACE, Adaptations
 from aftbed.runtime.deployment import HANG_NS, Deployment
@@ -166,6 +170,7 @@ class RunController:
         """Send it the situation; it may act again."""
         deployment = self.deployment
         self._runtime.log("roles", self.state(None, None).roles)
+        self._tell_redundancy()
         if self.executor.busy or not deployment.lives("recovery") or self.ending:
             return
         situation = self.executor.situation(failed=failed)
@@ -173,6 +178,19 @@ class RunController:
             deployment.order("recovery", lambda token: control.Deliver(token, "recovery", situation))
         except StepFailed as error:
             self._runtime.log("refused", str(error))
+
+    def _tell_redundancy(self) -> None:
+        """To those bricks of the leader that go by it."""
+        deployment = self.deployment
+        alone = bool(replication_of(deployment.graph.ftm)) and not deployment.backup
+        told = Redundancy(deployment.epoch, alone)
+        for brick in deployment.graph.bricks:
+            if brick.replica == deployment.leader and BRICKS[brick.kind].told_redundancy:
+                with suppress(StepFailed):  # a node that is dead is replaced, or its replica is
+                    deployment.leave(
+                        deployment.graph.node_of(brick.name),
+                        control.Deliver(control.UNANSWERED, brick.name, told),
+                    )
 
     # -- deaths and hangs -------------------------------------------------------------------------------
 

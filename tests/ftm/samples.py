@@ -21,6 +21,7 @@ from aftbed.core.messages import (
     Promoted,
     Promotion,
     Rebound,
+    Redundancy,
     Release,
     Reply,
     Request,
@@ -79,6 +80,7 @@ SAMPLES: Final[dict[type, AnyMessage]] = {
         TakeUp(1, Script("pbr to lfr", "", (), ()), Phase.COMMIT, False, ""),
         HoldAt((1,)),
         Release(1),
+        Redundancy(2, alone=True),
     )
 }
 assert set(SAMPLES) == set(get_args(AnyMessage)), "one sample of each type"

@@ -3,10 +3,10 @@
 import pytest
 from samples import notes, sends
 
-from aftbed.core.brick import Effect, Halt, Note, Send
+from aftbed.core.brick import CONTROL, Effect, Halt, Note, Send
 from aftbed.core.events import LATE, Event
-from aftbed.core.messages import Reply, Request, TakeOver
-from aftbed.ftm.failover import HANG_DEADLINE_NS
+from aftbed.core.messages import Redundancy, Reply, Request, TakeOver
+from aftbed.ftm.failover import HANG_DEADLINE_NS, LATE_NS_MAX
 from aftbed.ftm.supervision import DEADLINE_NS, LENIENT_NS, SupAfter, SupBefore
 
 NOW_NS = 5_000_000_000
@@ -82,36 +82,64 @@ def test_a_reply_that_was_not_announced_does_not_wait_for_ever() -> None:
     assert brick.deadline_ns() == NOW_NS + DEADLINE_NS
 
 
-def test_a_reply_that_comes_twice_stops_the_replica_before_the_next_one_leaves() -> None:
+def replied_twice() -> SupAfter:
     brick = supervising()
     brick.step("prd2aft", REPLY, NOW_NS)
     assert brick.step("prd2aft", REPLY, NOW_NS) == []
-    for effects in (brick.step("bfr2aft", Request(2, 8, b"what"), NOW_NS), brick.wake(NOW_NS + DEADLINE_NS)):
+    return brick
+
+
+def test_a_reply_that_comes_twice_stops_the_replica_before_the_next_one_leaves() -> None:
+    at_next = replied_twice().step("bfr2aft", Request(2, 8, b"what"), NOW_NS)
+    at_deadline = replied_twice().wake(NOW_NS + DEADLINE_NS)
+    for effects in (at_next, at_deadline):
         assert stopped(effects, 7) == "a reply to request 7, which was not announced"
 
 
-def test_a_replica_that_has_taken_over_is_given_more_time_for_a_while() -> None:
-    """The first request under another epoch shows it, whatever the mechanism around."""
-    brick = SupAfter(1, leads=True)
+@pytest.fixture(params=["a follower", "a leader whose backup is lost", "a leader since this request"])
+def irreplaceable(request: pytest.FixtureRequest) -> SupAfter:
+    """A replica that no other can replace, with a request inside."""
+    brick = SupAfter(1 if "since" in request.param else 2, leads="leader" in request.param)
+    if "lost" in request.param:
+        assert brick.step(CONTROL, Redundancy(2, alone=True), NOW_NS) == []
     brick.step("bfr2aft", REQUEST, NOW_NS)
-    assert brick.deadline_ns() == NOW_NS + LENIENT_NS
-    assert brick.step("prd2aft", REPLY, NOW_NS + 2 * DEADLINE_NS) == [Send("aft2pro", REPLY)]
-    brick.step("bfr2aft", Request(2, 8, b"what"), NOW_NS + LENIENT_NS - 1)
-    assert brick.deadline_ns() == NOW_NS + 2 * LENIENT_NS - 1
-    brick.step("prd2aft", Reply(2, 8, 1, b"that"), NOW_NS + LENIENT_NS)
-    brick.step("bfr2aft", Request(2, 9, b"what"), NOW_NS + LENIENT_NS)
-    assert brick.deadline_ns() == NOW_NS + LENIENT_NS + DEADLINE_NS
+    return brick
 
 
-def test_nobody_waits_for_a_follower_before_it_leads() -> None:
+def test_of_a_replica_that_no_other_can_replace_a_late_reply_leaves(irreplaceable: SupAfter) -> None:
+    assert irreplaceable.deadline_ns() == NOW_NS + LENIENT_NS
+    assert irreplaceable.step("prd2aft", REPLY, NOW_NS + 2 * LENIENT_NS) == [Send("aft2pro", REPLY)]
+
+
+def test_a_replica_that_no_other_can_replace_stops_without_a_reply(irreplaceable: SupAfter) -> None:
+    late = irreplaceable.wake(NOW_NS + LENIENT_NS + LATE_NS_MAX)
+    assert stopped(late, 7, LATE) == "request 7 took more than 500 ms"
+
+
+def test_a_machine_that_stood_still_does_not_stop_a_replica_that_no_other_can_replace(
+    irreplaceable: SupAfter,
+) -> None:
+    resumed_ns = NOW_NS + LENIENT_NS + LATE_NS_MAX + 1
+    assert irreplaceable.wake(resumed_ns) == []
+    assert irreplaceable.deadline_ns() == resumed_ns + LENIENT_NS
+    assert stopped(irreplaceable.wake(resumed_ns + LENIENT_NS), 7, LATE)
+
+
+def test_a_leader_that_has_a_backup_again_is_held_to_its_deadline(irreplaceable: SupAfter) -> None:
+    irreplaceable.step(CONTROL, Redundancy(2, alone=False), NOW_NS + 1)
+    assert irreplaceable.deadline_ns() == NOW_NS + DEADLINE_NS
+    assert stopped(irreplaceable.step("prd2aft", REPLY, NOW_NS + DEADLINE_NS), 7, LATE)
+
+
+def test_a_backup_that_stands_before_the_first_request_of_an_epoch_counts() -> None:
     brick = SupAfter(1, leads=False)
-    brick.step("bfr2aft", Request(1, 7, b"what"), NOW_NS)
-    assert brick.deadline_ns() == NOW_NS + LENIENT_NS
-    brick.step("prd2aft", REPLY, NOW_NS)
-    brick.step("bfr2aft", Request(2, 8, b"what"), NOW_NS)
-    brick.step("prd2aft", Reply(2, 8, 1, b"that"), NOW_NS)
-    brick.step("bfr2aft", Request(2, 9, b"what"), NOW_NS + LENIENT_NS)
-    assert brick.deadline_ns() == NOW_NS + LENIENT_NS + DEADLINE_NS
+    brick.step(CONTROL, Redundancy(2, alone=False), NOW_NS)
+    brick.step("bfr2aft", REQUEST, NOW_NS)
+    assert brick.deadline_ns() == NOW_NS + DEADLINE_NS
+
+
+def test_a_machine_that_stood_still_does_not_excuse_a_leader_with_a_backup() -> None:
+    assert stopped(supervising().wake(NOW_NS + 10 * LENIENT_NS), 7, LATE)
 
 
 def test_a_take_over_goes_the_way_of_a_request() -> None:

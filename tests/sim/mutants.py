@@ -187,9 +187,10 @@ def _flips(ftm: str, place: ValuePlace, *bits: int) -> list[Setup]:
     ]
 
 
-def _disturbed(words: str) -> list[Setup]:
-    """A step is skipped or doubled in the leader."""
-    return [Setup(ftm, count=8, faults=(parse(words),)) for ftm in ("pbr+sup", "lfr+sup")]
+def _disturbed(*words: str) -> list[Setup]:
+    """A step is skipped, doubled or late in the leader."""
+    faults = tuple(map(parse, words))
+    return [Setup(ftm, count=8, faults=faults) for ftm in ("pbr+sup", "lfr+sup")]
 
 
 MECHANISMS: Final = (
@@ -439,6 +440,14 @@ MECHANISMS: Final = (
         OWN,
         lambda: _disturbed("duplicate bfr2prd nth 4"),
         "G1",
+    ),
+    Mutant(
+        "a lost backup is not told",
+        "SupAfter stops a slow leader that no other replica can replace",
+        instead(SupAfter, "learn_redundancy", lambda self, msg: []),
+        OWN,
+        lambda: _disturbed("delay srv2prd by 40ms nth 6", "crash backup at server.exit nth 4"),
+        "G2",
     ),
     Mutant(
         "deaths not told",

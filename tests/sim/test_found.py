@@ -129,6 +129,19 @@ FOUND: Final = {
         faults=(hangs("primary", 50, "server.enter", 1),),
         adaptations=wanted_at("assert+tr", 2),
     ),
+    # Supervision stopped a slow leader, whose backup was lost, for a new one to take its place.
+    **{
+        f"a slow leader alone under {ftm}": Setup(
+            ftm,
+            count=60,
+            rate_hz=1000.0,
+            faults=(
+                Fault(Crash(), "backup", Trigger("server.exit", 20)),
+                Fault(ChannelFault(Disturbance.DELAY, "srv2prd", 40.0), "primary", Trigger(nth=22)),
+            ),
+        )
+        for ftm in ("pbr+sup", "lfr+sup")
+    },
 }
 
 
