@@ -26,7 +26,7 @@ from aftbed.runtime.node import Node
 from aftbed.runtime.unix.devices import ProcessSenses
 from aftbed.runtime.unix.journal_files import JournalFile
 from aftbed.runtime.unix.linux import set_timeouts, state_of
-from aftbed.runtime.unix.liveness import EXCUSED_NS_MAX, Liveness, Starvation
+from aftbed.runtime.unix.liveness import EXCUSED_NS_MAX, STILL_NS, Liveness, Starvation
 from aftbed.runtime.unix.node_io import UnixIO
 from aftbed.runtime.unix.transport import ANNOUNCED, ORDER_SECONDS, Line, decode_order
 
@@ -371,6 +371,26 @@ def test_runnable_without_a_cpu_starves_and_with_one_it_loops(word: str, excused
         while _cpu_ns(strong.pid) - before < PERIOD_NS:
             os.sched_yield()
         assert starvation.starves(1 + PERIOD_NS) is excused
+
+
+def test_one_that_ran_and_is_let_run_no_more_starves() -> None:
+    """As on a virtual core that stood still, which is then charged to it as CPU time."""
+    cpu = min(os.sched_getaffinity(0))
+    with process(LOOPS % (cpu, WEAK)) as weak:
+        starvation, before_ns = Starvation(weak.pid), _cpu_ns(weak.pid)
+        assert not starvation.starves(1)
+        while _cpu_ns(weak.pid) - before_ns < PERIOD_NS:
+            os.sched_yield()
+        assert not starvation.starves(1 + PERIOD_NS)
+        with process(LOOPS % (cpu, "")):
+            limit = time.monotonic() + SECONDS_MAX
+            while True:  # the weak one gets a little now and then
+                assert time.monotonic() < limit, "it never starves"
+                ran_ns = _cpu_ns(weak.pid)
+                starvation.starves(2 + PERIOD_NS)
+                if starvation.starves(2 + PERIOD_NS + STILL_NS):
+                    return
+                assert _cpu_ns(weak.pid) > ran_ns, "it got nothing, and does not starve"
 
 
 def _until_asleep(pid: int) -> None:

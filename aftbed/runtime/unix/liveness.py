@@ -26,6 +26,7 @@ from aftbed.runtime.unix.death_notice import FUTEX_OWNER_DIED
 from aftbed.runtime.unix.journal_files import JournalHeader
 
 EXCUSED_NS_MAX: Final = 2_000_000_000  # as long as any step of the runtime may take
+STILL_NS: Final = LOOK_NS * 3 // 2  # two looks; CPU time grows with each tick, which takes 10 ms at most
 RUNNING: Final = ("S", "R", "D")  # neither stopped nor dead
 _STATE_BYTES: Final = 128  # of /proc/PID/stat: the pid, a name of at most 16 bytes, the state
 
@@ -37,6 +38,8 @@ class Starvation:
     |------------------------|-------------------------------------------|---------------------------|
     | `T`, `t`, `Z`, `X`     | any                                       | hangs                     |
     | `R`, runnable          | at most half of the time                  | starves                   |
+    | `R`                    | more, but none for `STILL_NS`             | starves: its core stands  |
+    |                        |                                           | still                     |
     | `R`                    | more                                      | hangs: it loops           |
     | `D`, waits for a disk  | at most half of the time                  | starves                   |
     | `S`, asleep            | for a quarter of the time it was ready to | starves: it gets too      |
@@ -45,12 +48,14 @@ class Starvation:
     | program, starves       |                                           | child                     |
     | `S`                    | else                                      | hangs: blocked in a brick |
 
-    No excuse lasts longer than `EXCUSED_NS_MAX`.
+    No excuse lasts longer than `EXCUSED_NS_MAX`. The time for which a virtual core stood still may be counted
+    as CPU time of the process on it, all at once when it goes on; so the sum alone does not show a loop.
     """
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
         self._since_ns, self._cpu_ns, self._waited_ns = 0, 0, 0
+        self._grew_ns, self._last_cpu_ns = 0, 0  # when its CPU time was last found to have grown, and to what
         self._children: list[Starvation] = []
         self._stat = _open(pid)
 
@@ -83,14 +88,17 @@ class Starvation:
             return False
         if self._since_ns == 0:
             self._since_ns, self._cpu_ns, self._waited_ns = now_ns, cpu_ns, waited_ns
+            self._last_cpu_ns = -1
             self._children = [Starvation(child) for child in _children(self._pid)]
+        if cpu_ns != self._last_cpu_ns:
+            self._last_cpu_ns, self._grew_ns = cpu_ns, now_ns
         of_children = [child.starves(now_ns) for child in self._children]
         ran_ns, passed_ns = cpu_ns - self._cpu_ns, now_ns - self._since_ns
         if not 0 < passed_ns <= EXCUSED_NS_MAX:
             return False
         match state:
             case "R" | "D":
-                return 2 * ran_ns <= passed_ns
+                return 2 * ran_ns <= passed_ns or now_ns - self._grew_ns >= STILL_NS
             case "S":
                 return 4 * (waited_ns - self._waited_ns) > passed_ns or any(of_children)
             case _:
