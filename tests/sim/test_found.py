@@ -4,6 +4,7 @@ from typing import Final
 
 import pytest
 
+from aftbed.core.events import Event
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.inject.channel import ChannelFault, Disturbance
 from aftbed.inject.crash import Crash
@@ -149,6 +150,17 @@ FOUND: Final = {
 def test_it_is_mended(name: str) -> None:
     _, broken = attempt(FOUND[name])
     assert broken == ()
+
+
+@pytest.mark.parametrize("ftm", ["pbr+sup", "lfr+sup"])
+def test_a_slow_leader_that_has_a_backup_again_is_stopped(ftm: str) -> None:
+    """Its first backup was lost as above; the new one takes its place."""
+    slow = Fault(ChannelFault(Disturbance.DELAY, "srv2prd", 40.0), "primary", Trigger(nth=40))
+    crash = Fault(Crash(), "backup", Trigger("server.exit", 5))
+    run = simulate(Setup(ftm, count=60, rate_hz=200.0, faults=(crash, slow)))
+    assert breaches(run) == ()
+    assert len(run.history.events(Event.DETECTED_STOP)) == 1
+    assert len(run.history.events(Event.REPLICA_PROMOTED)) == 1
 
 
 def test_a_leader_that_dies_while_the_way_from_one_replica_to_two_is_observed_is_failed_over_from() -> None:
