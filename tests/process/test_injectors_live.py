@@ -16,14 +16,15 @@ pytestmark = pytest.mark.process
 
 CAUTIOUS: Final = "aftbed.vehicle.aeb.variants:Cautious"
 COUNT: Final = 240
-RATE_HZ: Final = 200.0
+RATE_HZ: Final = 50.0
 BEHIND: Final = 60  # requests: each fault here is over by then, or strikes a few of those behind it
 CLASS: Final = 4.0  # by how much medians of the same class differ at most, on a machine that others use too
 
 
-def ran(home: Home, ftm: str, *texts: str, placement: str = "process", count: int = COUNT) -> Outcome:
+def ran(home: Home, ftm: str, *texts: str, placement: str = "process") -> Outcome:
+    """In a closed loop: if the machine holds up a request, none queues behind it, and it is one of many."""
     faults = tuple(map(parse, texts))
-    with Started(home, LoadRun(count, RATE_HZ), ftm=ftm, placement=placement, faults=faults) as run:
+    with Started(home, LoadRun(COUNT, 0.0), ftm=ftm, placement=placement, faults=faults) as run:
         return run.finish()
 
 
@@ -57,7 +58,7 @@ def assert_healed(outcome: Outcome, until: int) -> None:
 
 @pytest.mark.parametrize("placement", ["process", "replica"])
 def test_a_slow_replica_takes_longer_for_so_long(home: Home, placement: str) -> None:
-    fault = "slow primary by 1ms for 60ms at request.received nth 10"
+    fault = "slow primary by 1ms for 200ms at request.received nth 10"
     outcome = ran(home, "pbr", fault, placement=placement)
     took = latencies_ms(outcome)
     assert min(took[n] for n in range(10, 16)) > 5.0, "five bricks, some of them more than once"
@@ -94,7 +95,7 @@ def test_a_delay_holds_back_what_is_sent(home: Home, channel: str, placement: st
 
 
 def test_an_omission_loses_one_reply_and_no_other(home: Home) -> None:
-    """A load waits for its last reply for ever: so it is told to stop."""
+    """A load waits for a lost reply for ever: so it sends at a rate, and is told to stop."""
     fault = parse("omission pxy2clt nth 10")
     with Started(home, LoadRun(COUNT, RATE_HZ), faults=(fault,)) as run:
         run.wait_for_answers(COUNT - 1)
