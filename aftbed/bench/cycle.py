@@ -148,7 +148,7 @@ class CycleRun(NamedTuple):
         """The first `count` cycles that `settled` leaves, after a warm-up, and what `other` measured in the
         turns between those of the load (us).
 
-        The latter are none where it was not let run at all. Raises HarnessError.
+        Raises HarnessError.
         """
         with other(THEIRS) as measured:
             record = self._record(sent_for(count), OURS)
@@ -186,8 +186,7 @@ def _beside_us(measured: Iterable[TimedSample], record: RunRecord) -> list[float
     """What was measured in the other turns, between the first and the last request of `record`."""
     sent = answered(record)
     began_ns, ended_ns = sent[0].began_ns, sent[-1].began_ns
-    within = (one for one in measured if began_ns <= one.began_ns <= ended_ns)
-    return [one.us for one in settled(within, THEIRS, 1)]
+    return _within_us(measured, THEIRS, began_ns, ended_ns)
 
 
 def side_by_side(sides: Sequence[Side], turn_ns: int, seconds: float) -> list[list[float]]:
@@ -199,10 +198,18 @@ def side_by_side(sides: Sequence[Side], turn_ns: int, seconds: float) -> list[li
         began_ns = time.monotonic_ns()
         time.sleep(seconds)
         ended_ns = time.monotonic_ns()
-    return [
-        [one.us for one in settled((one for one in of if began_ns <= one.began_ns < ended_ns), its, 1)]
-        for of, its in zip(measured, turns, strict=True)
-    ]
+    return [_within_us(of, its, began_ns, ended_ns) for of, its in zip(measured, turns, strict=True)]
+
+
+def _within_us(measured: Iterable[TimedSample], turns: Turns, began_ns: int, ended_ns: int) -> list[float]:
+    """What was measured in `turns`, between two times (us). Raises HarnessError where that is nothing."""
+    found = settled((one for one in measured if began_ns <= one.began_ns <= ended_ns), turns, 1)
+    if not found:
+        raise HarnessError(
+            f"one side measured nothing in its turns of {(ended_ns - began_ns) / 1e6:.0f} ms: the machine is"
+            " too busy for this measurement; repeat it when less else runs, or let it measure for longer"
+        )
+    return [one.us for one in found]
 
 
 def settled(measured: Iterable[TimedSample], turns: Turns, least: int) -> list[TimedSample]:

@@ -24,6 +24,7 @@ from aftbed.bench.cycle import (
     settled,
     side_by_side,
 )
+from aftbed.bench.rounds import together
 from aftbed.bench.runs import TimedSample, endless_run, limited_run, wait_for
 from aftbed.core.errors import HarnessError
 from aftbed.core.journal import EntryKind
@@ -119,6 +120,23 @@ def test_three_sides_are_measured_in_one_time_each_in_its_own_turns(home: Home) 
         assert len(us) < len(measured)  # without the warm-up
         own = [one for one in measured if not turns.left_ns(one.began_ns)]
         assert len(own) > len(measured) / 2 and set(us) <= {one.us for one in own}
+
+
+@contextlib.contextmanager
+def silent(_: Turns) -> Iterator[list[TimedSample]]:
+    """A side that the machine does not let run."""
+    yield []
+
+
+@pytest.mark.process
+def test_a_side_that_measured_nothing_fails_the_measurement_which_is_then_repeated(home: Home) -> None:
+    sides = iter((silent, partial(ring_in_turns, RING, 64, pin=True)))
+    run = CycleRun("none", "single")
+    found = together(1, lambda _: run.cycles_beside(60, next(sides)))
+    assert found.machine.failures == 1 and len(found.figures[0]) == 60 and found.limits[0]
+    reason = r"one side measured nothing in its turns of \d+ ms: .* let it measure for longer"
+    with pytest.raises(HarnessError, match=reason):
+        side_by_side([silent, silent], TURN_NS, 0.01)
 
 
 @pytest.mark.process
