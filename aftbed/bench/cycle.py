@@ -206,8 +206,8 @@ def _within_us(measured: Iterable[TimedSample], turns: Turns, began_ns: int, end
     found = settled((one for one in measured if began_ns <= one.began_ns <= ended_ns), turns, 1)
     if not found:
         raise HarnessError(
-            f"one side measured nothing in its turns of {(ended_ns - began_ns) / 1e6:.0f} ms: the machine is"
-            " too busy for this measurement; repeat it when less else runs, or let it measure for longer"
+            f"one side measured nothing in its turns within {(ended_ns - began_ns) / 1e6:.0f} ms: the machine"
+            " is too busy for this measurement; repeat it when less else runs, or let it measure for longer"
         )
     return [one.us for one in found]
 

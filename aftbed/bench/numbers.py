@@ -31,9 +31,9 @@ from aftbed.runtime.unix.code_version import code_version
 
 COMMAND_SECONDS_MAX: Final = 1200.0
 BEGIN, END = "<!-- numbers: begin -->", "<!-- numbers: end -->"  # of the table in a page
-QUICK: Final = {  # what makes a command short; too few samples to quote
-    "cycle": "--count 200 --rounds 2",
-    "hops": "--count 200 --rounds 2",
+QUICK: Final = {  # what makes a command short: too few samples to quote, but more than a few turns
+    "cycle": "--count 1000 --rounds 2",
+    "hops": "--count 1000 --rounds 2",
     "recovery": "--kills 2",
     "adapt": "--adaptations 2",
     "launch": "--runs 1",

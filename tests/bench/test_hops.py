@@ -15,7 +15,7 @@ from aftbed.campaign.statistics import quantile
 from aftbed.core.events import Event
 from aftbed.ftm.compose import EXPRESSIONS, build
 
-REQUESTS: Final = 100
+REQUESTS: Final = 1000
 PBR_PAIRS: Final = [
     ("a/protocol request.received", "a/before before.exit"),
     ("a/before before.exit", "a/proceed proceed.enter"),

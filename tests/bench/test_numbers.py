@@ -101,7 +101,7 @@ def test_each_command_is_run_once() -> None:
 def test_a_quick_run_measures_less() -> None:
     logged: list[str] = []
     (found,) = bench_all(logged.append, quick=True, measure=fake)
-    assert logged[0] == "aftbed bench cycle --ftm pbr --count 200 --rounds 2"
+    assert logged[0] == "aftbed bench cycle --ftm pbr --count 1000 --rounds 2"
     assert found.quick and found.numbers[0].command == "aftbed bench cycle --ftm pbr"
     assert set(QUICK) <= set(DOCUMENTS)
 

@@ -134,7 +134,7 @@ def test_a_side_that_measured_nothing_fails_the_measurement_which_is_then_repeat
     run = CycleRun("none", "single")
     found = together(1, lambda _: run.cycles_beside(60, next(sides)))
     assert found.machine.failures == 1 and len(found.figures[0]) == 60 and found.limits[0]
-    reason = r"one side measured nothing in its turns of \d+ ms: .* let it measure for longer"
+    reason = r"one side measured nothing in its turns within \d+ ms: .* let it measure for longer"
     with pytest.raises(HarnessError, match=reason):
         side_by_side([silent, silent], TURN_NS, 0.01)
 
