@@ -428,6 +428,7 @@ def _turn_until_told(
     work: RingWork | None,
 ) -> None:
     """Turn a ring in `turns` until the line ends; then send when each turn began, and its time (ns)."""
+    os.setsid()  # as a run has: the kernel shares a core among sessions, and starved a run beside a busy one
     taken = array("q")
     with _ring(shape, packet_bytes, pin=pin, work=work) as turn_us:
         while not linux.readable((line.fileno(),), turns.left_ns(time.monotonic_ns()) / 1e9):
