@@ -134,9 +134,9 @@ def test_crashes_and_adaptations_begin_when_they_are_due() -> None:
 
 @pytest.mark.process
 def test_a_short_run_serves_all_and_does_not_say_that_nothing_grows(home: Home) -> None:
-    found = bench_soak(SoakPlan(0.06, 200.0, 0.5, 1.0, "process"), lambda _: None)
+    found = bench_soak(SoakPlan(0.1, 200.0, 0.5, 1.0, "process"), lambda _: None)
     assert found.judged == "pass", found.reasons
-    assert (found.requests.sent, found.requests.lost) == (720, 0)
+    assert (found.requests.sent, found.requests.lost) == (1200, 0)
     assert found.crashes["primary"] >= 1 and sum(found.crashes.values()) >= 2
     assert set(found.adaptations) <= set(DUPLEX_EXPRESSIONS) and found.adaptations
     assert [one.unit for one in found.trends if one.what.startswith("crash to next reply")] == ["x"] * 3
