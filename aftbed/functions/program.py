@@ -121,7 +121,7 @@ def read_answer(line: bytes, number: int, asked: str) -> Value:
     """
     try:
         answer = _decode(line)
-    except (msgspec.MsgspecError, ValueError) as error:  # ValueError: no UTF-8
+    except (msgspec.MsgspecError, ValueError) as error:  # ValueError: no UTF-8, before msgspec 0.23
         raise ValueError(f"{_excerpt(line)}: {error}") from None
     if answer.id != number:
         raise ValueError(f"{_excerpt(line)}: the id is {answer.id}, not {number}")
