@@ -2,13 +2,14 @@
 
 import contextlib
 import itertools
+import os
 import time
 from collections.abc import Iterator
 from functools import partial
 
 import psutil
 import pytest
-from homes import Home
+from homes import Home, until
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -137,6 +138,16 @@ def test_a_side_that_measured_nothing_fails_the_measurement_which_is_then_repeat
     reason = r"one side measured nothing in its turns within \d+ ms: .* let it measure for longer"
     with pytest.raises(HarnessError, match=reason):
         side_by_side([silent, silent], TURN_NS, 0.01)
+
+
+@pytest.mark.process
+def test_a_ring_has_a_session_of_its_own_as_a_run_has(home: Home) -> None:
+    """The kernel shares a core among sessions: in that of a busy bench it takes the core from the run."""
+    before = set(psutil.Process().children())
+    with ring_in_turns(RING, 64, THEIRS, pin=True):
+        (ring,) = set(psutil.Process().children()) - before
+        until(lambda: len(ring.children()) == RING.hops, "the others of its hops, and the backup's")
+        assert {os.getsid(one.pid) for one in (ring, *ring.children())} == {ring.pid}
 
 
 @pytest.mark.process
