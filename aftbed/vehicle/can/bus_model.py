@@ -247,6 +247,14 @@ class BusModel(ABC, Generic[Node]):
             self.deliver(*delivery)
         self._update_faults(disturber)
 
+    def advance(self, now_us: int) -> None:
+        """Bring the bus to now, where nobody holds the time: what was sent first, then what faults release.
+
+        A frame was sent before now and is struck by its own time, so no fault may end before it is carried.
+        """
+        self.carry(now_us)
+        self.release(now_us)
+
     # -- faults and conditions ------------------------------------------------------------------
 
     def disturb(self, disturber: BusDisturber) -> None:

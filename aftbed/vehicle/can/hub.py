@@ -307,9 +307,7 @@ class Hub(BusModel[HubConnection]):
         alive = True
         while alive:
             alive = self._attend_all(self._wait())
-            if self.disturbed and not self._options.lockstep:
-                self.release(self.now_us())
-            self.carry(None if self._options.lockstep else self.now_us())
+            self._carry_sent()
             if self._awaiting is not None:
                 self._answer_await(*self._awaiting)
             if self._leaving:
@@ -321,7 +319,7 @@ class Hub(BusModel[HubConnection]):
         end_s = time.monotonic() + LAST_FRAMES_S_MAX
         while time.monotonic() < end_s and (events := self._epoll.poll(0, EVENTS_MAX)):
             self._attend_all(events)
-            self.carry(None if self._options.lockstep else self.now_us())
+            self._carry_sent()
         for client in list(self._clients.values()):
             if client.account is not None and client.leaves_s is None:
                 self._say_last(client, "the run has ended")
@@ -348,6 +346,13 @@ class Hub(BusModel[HubConnection]):
             self._send(car, self._ok())
 
     # -- time and waiting -----------------------------------------------------------------------
+
+    def _carry_sent(self) -> None:
+        """Carry what was sent until now; in lockstep, faults release with the time that is set."""
+        if self._options.lockstep:
+            self.carry()
+        else:
+            self.advance(self.now_us())
 
     def now_us(self) -> int:
         if self._options.lockstep:
@@ -547,6 +552,8 @@ class Hub(BusModel[HubConnection]):
                 raise PeerError("unknown command, or not now")
 
     def _condition_met(self, car: HubConnection, fault_number: int, t_us: int, since_ns: int) -> None:
+        if not self._options.lockstep:
+            self.advance(self.now_us())
         met = self.met(fault_number, self.now_us())
         if met and self._link is not None and self._options.lockstep:
             self._held[fault_number] = car

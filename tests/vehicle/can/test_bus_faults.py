@@ -12,6 +12,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from busharness import DEADLINE_S, RawClient, RunningHub, running_hub
+from buslog import read_log
 from disturbed import FIRST_NUMBER, Disturbed, fault, real, virtual
 from puredrive import CODEC
 from sampling import every
@@ -304,6 +305,24 @@ class Node(RawClient):
         while (element := self.read()) != "< echo >":
             found.append(int(element.split()[2], 16))
         return found
+
+
+def test_frames_sent_before_a_fault_ends_are_struck_however_late_the_hub_carries_them(tmp_path: Path) -> None:
+    """Two hundred come in one read, so a fault ends between the times of two that are carried together."""
+    sent, lasting_us = f"< send {TRACK:03x} 1 1 >", list[int]()
+    with running_hub(tmp_path / "bus.log", HubOptions()) as hub, Node(hub.port, "radar") as radar:
+        for number in range(20):
+            lasting_us.append(300 + 100 * number)
+            arm(hub, f"omission bus RADAR_TRACK for {lasting_us[-1] / 1000}ms", FIRST_NUMBER + number)
+            radar.write(sent)  # here it begins
+            radar.fence()
+            radar.write(sent * 200)
+            radar.fence()
+        struck = hub.struck()
+    carried_us = [entry.frame.t_us for entry in read_log(tmp_path / "bus.log")[0]]
+    for one, for_us in zip(struck, lasting_us, strict=True):
+        assert one.frames > 0
+        assert not [t_us for t_us in carried_us if one.first_us <= t_us < one.first_us + for_us]
 
 
 def test_a_partition_that_ends_gives_all_their_traffic_back(hub: RunningHub) -> None:
