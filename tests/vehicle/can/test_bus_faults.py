@@ -28,7 +28,7 @@ TRACK, AEB_REQ, EGO, STATUS = (
     CODEC.can_id(name) for name in ("RADAR_TRACK", "AEB_REQ", "EGO_STATE", "BRAKE_STATUS")
 )
 HEARTBEAT = CODEC.can_id("FTM_HEARTBEAT_1")  # comes by its own time
-PACES = (4.0, 4.0, 2.0, 2.0, 1.0, 1.0, 0.5, 0.25)  # of the tries of a paced drive
+PACES = (2.0, 2.0, 1.0, 1.0, 0.5, 0.25)  # of the tries of a paced drive
 TRACK_MS = 20.0  # between two frames
 LAG_MS_MAX = 40.0  # of the bus; the slower the drive, the more of the clock it is
 FIRST = {"sequence": 2}  # what every gateway refuses: the first frame of each of its two
