@@ -873,6 +873,17 @@ MUTANTS: Final = (
         ),
     ),
     SourceMutant(
+        "a fault of the bus ends before what was sent within it is carried",
+        "G8",
+        "aftbed/vehicle/can/bus_model.py",
+        "self.carry(now_us)\n        self.release(now_us)",
+        "self.release(now_us)\n        self.carry(now_us)",
+        PROCESS,
+        (
+            "tests/vehicle/can/test_bus_faults.py::test_frames_sent_before_a_fault_ends_are_struck_however_late_the_hub_carries_them",
+        ),
+    ),
+    SourceMutant(
         "a fault of the bus is handled before a node that is heard late has recovered",
         "G8",
         "aftbed/inject/bus_disturber.py",
