@@ -8,6 +8,8 @@ BIN      := $(VENV)/bin
 PLAIN    := $(VENV)/.installed-plain
 EDITABLE := $(VENV)/.installed-editable
 DOCS     := $(VENV)/.installed-docs
+# With these versions of the libraries the tests passed: a new release of one turns no test red before it is taken here.
+TESTED_WITH := tests/constraints.txt
 SOURCES  := pyproject.toml README.md $(shell find aftbed dbc -type f -not -name '*.pyc')
 
 # The tests without real runs take every core: those of one thing each, which are run while one edits, then whole
@@ -28,7 +30,7 @@ FAULT := crash primary at checkpoint.sent nth 100
 # Hundreds of interpreters start in the tests; without bytecode each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test lint fast simulation process pages noisy deep mutants bench soak docs pictures
+.PHONY: help demo test lint fast simulation process pages noisy deep mutants bench soak docs pictures constraints
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
 
@@ -45,8 +47,9 @@ help:
 	@echo "make docs        the pages of docs/ as a site: build/docs/index.html"
 	@echo "make pictures    the pictures of the README, of runs that it makes (ONLY=page: that one; with Chromium and tmux)"
 	@echo "make mutants     plant bugs one by one, see what notices them, write docs/assumptions.md (ONLY=words: some, print)"
+	@echo "make constraints the newest libraries into tests/constraints.txt: then make test, and commit it"
 	@echo "make soak        one run of 30 minutes with a crash every 2 s, an adaptation every 5 s: does anything grow?"
-	@echo "make bench       every figure of docs/numbers.md, written into its table: a quarter of an hour (PASSES=10: ten times; OLD=VENV: then compare with it)"
+	@echo "make bench       every figure of docs/numbers.md, written into its table: 25 minutes (PASSES=10: ten times; OLD=VENV: then compare with it)"
 
 # Where the tests are installed, the package is too: then the demo needs nothing more.
 demo: $(if $(wildcard $(EDITABLE)),$(EDITABLE),$(PLAIN))
@@ -95,6 +98,13 @@ docs: $(DOCS)
 pictures: $(EDITABLE)
 	$(BIN)/python tests/docs/make_pictures.py $(ONLY)
 
+# From an environment of its own, with what a new user gets today.
+constraints:
+	$(PYTHON) -m venv --clear build/newest
+	build/newest/bin/python -m pip install --quiet --disable-pip-version-check -e ".[test]"
+	@echo "# The versions of the libraries with which the tests pass. To take the newest: make constraints" > $(TESTED_WITH)
+	build/newest/bin/python -m pip list --disable-pip-version-check --format=freeze --exclude aftbed --exclude pip --exclude setuptools >> $(TESTED_WITH)
+
 # -- installation: a stamp each, so that a second `make` installs only what has changed ------------
 
 $(BIN)/python:
@@ -106,8 +116,8 @@ $(PLAIN): $(SOURCES) | $(BIN)/python
 	@rm -f $(EDITABLE)
 	@touch $@
 
-$(EDITABLE): pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[test]"
+$(EDITABLE): pyproject.toml $(TESTED_WITH) | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(TESTED_WITH) -e ".[test]"
 	@rm -f $(PLAIN)
 	@touch $@
 
