@@ -411,10 +411,10 @@ def ring_in_turns(
                 data.frombytes(got.read())
             os.kill(child, signal.SIGKILL)  # it has ended, or it hangs
             os.waitpid(child, 0)
-    if not data:
+    if not data or len(data) != 1 + data[0]:
         raise HarnessError("the bare ring: one of its processes died")
     found += [
-        TimedSample(began_ns, took_ns / 1e3) for began_ns, took_ns in zip(data[::2], data[1::2], strict=True)
+        TimedSample(began_ns, took_ns / 1e3) for began_ns, took_ns in zip(data[1::2], data[2::2], strict=True)
     ]
 
 
@@ -427,14 +427,17 @@ def _turn_until_told(
     pin: bool,
     work: RingWork | None,
 ) -> None:
-    """Turn a ring in `turns` until the line ends; then send when each turn began, and its time (ns)."""
+    """Turn a ring in `turns` until the line ends; then send how many numbers follow, and of each turn two.
+
+    These are when it began, and its time (ns).
+    """
     os.setsid()  # as a run has: the kernel shares a core among sessions, and starved a run beside a busy one
     taken = array("q")
     with _ring(shape, packet_bytes, pin=pin, work=work) as turn_us:
         while not linux.readable((line.fileno(),), turns.left_ns(time.monotonic_ns()) / 1e9):
             while not turns.left_ns(began_ns := time.monotonic_ns()):
                 taken.extend((began_ns, round(turn_us() * 1e3)))
-    line.sendall(taken.tobytes())
+    line.sendall(array("q", [len(taken), *taken]).tobytes())
 
 
 @contextlib.contextmanager

@@ -151,6 +151,15 @@ def test_a_ring_has_a_session_of_its_own_as_a_run_has(home: Home) -> None:
 
 
 @pytest.mark.process
+def test_a_ring_that_is_ended_before_its_first_turn_has_measured_nothing_and_has_not_died() -> None:
+    halves = [Turns(10**12, number, 2) for number in range(2)]
+    (later,) = (turns for turns in halves if turns.left_ns(time.monotonic_ns()))
+    with ring_in_turns(RING, 64, later, pin=True) as measured:
+        pass
+    assert measured == []
+
+
+@pytest.mark.process
 def test_a_ring_that_dies_ends_the_measurement(home: Home) -> None:
     before = set(psutil.Process().children())
     with (

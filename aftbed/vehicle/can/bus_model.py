@@ -248,9 +248,9 @@ class BusModel(ABC, Generic[Node]):
         self._update_faults(disturber)
 
     def advance(self, now_us: int) -> None:
-        """Bring the bus to now, where nobody holds the time: what was sent first, then what faults release.
+        """Bring a bus that runs by the clock to now: carry what was sent, then what faults release.
 
-        A frame was sent before now and is struck by its own time, so no fault may end before it is carried.
+        A frame is struck by the time at which it was sent, so no fault may end before it is carried.
         """
         self.carry(now_us)
         self.release(now_us)
