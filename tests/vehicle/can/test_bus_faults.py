@@ -29,6 +29,7 @@ TRACK, AEB_REQ, EGO, STATUS = (
 )
 HEARTBEAT = CODEC.can_id("FTM_HEARTBEAT_1")  # comes by its own time
 PACES = (2.0, 2.0, 1.0, 1.0, 0.5, 0.25)  # of the tries of a paced drive
+HOLDS_US = 1_501_000  # the first step with ttc < 2.5: ccrs-50 begins at 4 s, and does not brake before
 TRACK_MS = 20.0  # between two frames
 LAG_MS_MAX = 40.0  # of the bus; the slower the drive, the more of the clock it is
 FIRST = {"sequence": 2}  # what every gateway refuses: the first frame of each of its two
@@ -224,8 +225,7 @@ def test_a_paced_drive_meets_its_condition_and_heals(tmp_path: Path) -> None:
         if max(lag_ms, gap_us / 1e3 - TRACK_MS) < LAG_MS_MAX:
             break
     (struck,) = drive.struck
-    gap = virtual("omission bus AEB_REQ when ttc < 2.5 for 100ms").struck[0]
-    assert gap.first_us - 10_000 <= struck.first_us
+    assert struck.first_us >= HOLDS_US
     assert struck.frames >= 1 and struck.receipt.state.value == "activated"
     carried_us = [frame.t_us for frame in drive.of(AEB_REQ)]
     assert not [t for t in carried_us if struck.first_us <= t < struck.first_us + 100_000]
